@@ -1,0 +1,44 @@
+# `make demo` and `make test` are all that a fresh machine needs: Python 3.11 or newer and make.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+OUT    ?= demo-output
+
+.PHONY: demo test lint bench real-recordings clean help
+
+help:  ## list the targets
+	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
+
+$(VENV)/.installed: pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -e .
+	touch $@
+
+$(VENV)/.installed-test: $(VENV)/.installed
+	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[test]"
+	touch $@
+
+$(VENV)/.installed-lint: $(VENV)/.installed-test
+	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[test,lint]"
+	touch $@
+
+demo: $(VENV)/.installed  ## install and run the main job on the shipped log
+	$(BIN)/gyrostab demo -o $(OUT) --overwrite
+
+test: $(VENV)/.installed-test  ## install and run the tests
+	$(BIN)/python -m pytest -n auto --dist loadgroup
+
+lint: $(VENV)/.installed-lint  ## style, types and imports
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.installed-test  ## time the kernels beside their peers
+	$(BIN)/python benchmarks/kernels.py
+
+real-recordings: $(VENV)/.installed  ## remake docs/real-recordings.md from the recordings, where they are present
+	$(BIN)/python pipelines/real_recordings.py
+
+clean:  ## remove what the targets made
+	rm -rf $(VENV) $(OUT)

@@ -1,0 +1,1 @@
+"""gyrostab: gyro logs to dynamic Allan variance and time-varying noise coefficients."""

@@ -1,0 +1,127 @@
+"""The five noise laws of a gyro in one table, read by fit, simulation, plots and export.
+
+===== ====================== ============================== ================= ==============
+term  name                   Allan variance                 rate PSD          unit
+===== ====================== ============================== ================= ==============
+Q     quantization           3 Q^2 / tau^2                  (2 pi f)^2 Q^2 T  urad
+N     angle random walk      N^2 / tau                      N^2               deg/sqrt(h)
+B     bias instability       (2 ln 2 / pi) B^2              B^2 / (2 pi f)    deg/h
+K     rate random walk       K^2 tau / 3                    (K / 2 pi f)^2    deg/h^1.5
+R     rate ramp              R^2 tau^2 / 2                  (deterministic)   deg/h^2
+===== ====================== ============================== ================= ==============
+
+The PSDs are two-sided, as in IEEE Std 952; T is the sampling interval.
+
+References
+----------
+IEEE Std 952-1997, annex C; Wang et al., Sensors 16 (2016), Eq. 8-9 (there Q is labelled arcsec although the factor
+10^6 pi / (180 * 3600 sqrt 3) gives microradian, and Table 1 prints K^2 / (2 pi f^2) for the rate random walk).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LAWS", "TERMS", "NoiseLaw", "avar_columns", "model_avar"]
+
+HOUR = 3600.0
+#: One microradian per second in degree per hour.
+URAD_PER_S = 1e-6 * 180.0 / math.pi * HOUR
+
+
+@dataclass(frozen=True)
+class NoiseLaw:
+    """One term of the Allan variance, ``avar = coefficient**2 * scale * tau**power`` (tau in s, avar in deg^2/h^2).
+
+    Attributes
+    ----------
+    symbol, name : str
+        Letter and name of IEEE Std 952.
+    scale : float
+        Factor of the Allan variance [degree2 hour-2 per squared coefficient per second**power].
+    power : int
+        Exponent of tau in the Allan variance.
+    label : str
+        The field's unit of the coefficient, for people.
+    units : str
+        What UDUNITS must read for the stored number.
+    squared_units : str
+        Exact dimension of the squared coefficient, as a UDUNITS string.
+    tau_ref_hours : float or None
+        Averaging time at which the Allan deviation of the term equals the stored number, where `units` says so.
+    """
+
+    symbol: str
+    name: str
+    scale: float
+    power: int
+    label: str
+    units: str
+    squared_units: str
+    tau_ref_hours: float | None = None
+
+    def avar(self, tau: Any, coefficient: float = 1.0) -> NDArray[np.float64]:
+        """Allan variance of the term [degree2 hour-2] at `tau` [s] for `coefficient` [`label`]."""
+        tau = np.asarray(tau, dtype=np.float64)
+        return np.asarray(coefficient**2 * self.scale * tau**self.power)
+
+
+#: The laws by symbol, in the order of rising power of tau.
+LAWS: dict[str, NoiseLaw] = {
+    law.symbol: law
+    for law in (
+        NoiseLaw("Q", "quantization", 3.0 * URAD_PER_S**2, -2, "urad", "microradian", "microradian2"),
+        NoiseLaw("N", "angle random walk", HOUR, -1, "deg/sqrt(h)", "degree hour-1", "degree2 hour-1", 1.0),
+        NoiseLaw("B", "bias instability", 2.0 * math.log(2.0) / math.pi, 0, "deg/h", "degree hour-1", "degree2 hour-2"),
+        NoiseLaw("K", "rate random walk", 1.0 / (3.0 * HOUR), 1, "deg/h^1.5", "degree hour-1", "degree2 hour-3", 3.0),
+        NoiseLaw("R", "rate ramp", 0.5 / HOUR**2, 2, "deg/h^2", "degree hour-2", "degree2 hour-4"),
+    )
+}
+
+#: Symbols in table order.
+TERMS = tuple(LAWS)
+
+
+def avar_columns(tau: Any) -> NDArray[np.float64]:
+    """Design matrix of the five-term model: Allan variance per squared coefficient.
+
+    Parameters
+    ----------
+    tau : array_like, shape (n_tau,)
+        Averaging times [s].
+
+    Returns
+    -------
+    ndarray, shape (n_tau, 5)
+        Columns in the order of `TERMS` [degree2 hour-2 per squared coefficient unit].
+
+    Examples
+    --------
+    >>> avar_columns([3600.0])[0, 1]  # N = 1 deg/sqrt(h) has an Allan variance of 1 (deg/h)^2 at one hour
+    np.float64(1.0)
+    """
+    return np.stack([law.avar(tau) for law in LAWS.values()], axis=-1)
+
+
+def model_avar(tau: Any, coefficients: Mapping[str, float]) -> NDArray[np.float64]:
+    """Allan variance [degree2 hour-2] of a sum of terms.
+
+    Parameters
+    ----------
+    tau : array_like
+        Averaging times [s].
+    coefficients : mapping of str to float
+        Symbol to value in the unit of its law; absent terms are zero.
+
+    Examples
+    --------
+    >>> float(model_avar(3600.0, {"N": 3.0, "B": 0.0}))
+    9.0
+    """
+    return np.asarray(sum((LAWS[symbol].avar(tau, value) for symbol, value in coefficients.items()), np.zeros(np.shape(tau))))

@@ -1,0 +1,169 @@
+"""Names, dimensions and units of the datasets that pass between the stages, and one check for each.
+
+raw log      what a reader returns: columns by ``row`` with the stamps as they were written
+log          uniform time, NaN at every missing sample, a table of gaps
+surface      dynamic Allan variance by ``(axis, time, tau)``
+product      surface plus the coefficients Q, N, B, K, R by ``(axis, time)``
+
+A recording and a simulation have the same schema. The table `VARIABLES` holds the attributes of every product variable;
+the stages and the export all read it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import SchemaError
+from gyrostab.noise import LAWS, TERMS
+from gyrostab.units import INNER
+
+__all__ = [
+    "ESTIMATORS",
+    "GAP_CAUSES",
+    "OBSERVABLE",
+    "SIGNAL_UNITS",
+    "VARIABLES",
+    "attributes",
+    "check_log",
+    "check_product",
+    "check_raw",
+    "check_surface",
+    "log_channels",
+    "signal_name",
+]
+
+#: Flag values of ``gap_cause(gap)``, in the order of their numbers.
+GAP_CAUSES = ("missing", "unreadable", "duplicate", "out_of_order", "outside_range", "clock_step", "restart")
+
+#: Flag values of ``estimator(axis, time, tau)``: how a cell of the surface was estimated.
+ESTIMATORS = ("none", "strict_runs", "weighted_clusters")
+
+#: Flag values of ``observable(axis, time, term)``.
+OBSERVABLE = ("not_observable", "upper_limit_only", "observed")
+
+#: Name of the gyro signal -> its unit; a log has one of them, and its ``kind`` attribute names it.
+SIGNAL_UNITS = {"rate": INNER["rate"], "angle": INNER["angle"]}
+
+
+def _flags(meanings: tuple[str, ...]) -> dict[str, Any]:
+    return {"flag_values": np.arange(len(meanings), dtype=np.int8), "flag_meanings": " ".join(meanings)}
+
+
+#: Product variable -> attributes. CF, UDUNITS spelling; ``axis`` and ``term`` hold strings and so carry no unit.
+VARIABLES: dict[str, dict[str, Any]] = {
+    "time": {"long_name": "centre of the window", "standard_name": "time", "bounds": "time_bounds", "axis": "T"},
+    "tau": {"long_name": "averaging time", "units": "s"},
+    "axis": {"long_name": "sensor axis"},
+    "term": {"long_name": "noise term, symbol of IEEE Std 952"},
+    "avar": {"long_name": "dynamic overlapping Allan variance of the rotation rate", "units": "degree2 hour-2"},
+    "count": {"long_name": "second differences used", "units": "1"},
+    "coverage": {"long_name": "second differences used, share of the gap-free number", "units": "1"},
+    "edf": {"long_name": "equivalent degrees of freedom of the Allan variance", "units": "1"},
+    "estimator": {"long_name": "estimator of the Allan variance", **_flags(ESTIMATORS)},
+    "white_response": {
+        "long_name": "Allan variance of angle random walk seen through the gaps, as a share of the gap-free law",
+        "units": "1",
+    },
+    "quantization_response": {
+        "long_name": "Allan variance of quantization noise seen through the gaps, as a share of the gap-free law",
+        "units": "1",
+    },
+    "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
+    "window_coverage": {"long_name": "share of the window's samples that are present", "units": "1"},
+    "observable": {"long_name": "what the window can tell of the noise term", **_flags(OBSERVABLE)},
+    "fit_chi2": {"long_name": "misfit of the five-term model, generalised least squares chi-square", "units": "1"},
+    "fit_dof": {"long_name": "degrees of freedom of the misfit", "units": "1"},
+}
+
+
+def _add_coefficients() -> None:
+    for symbol, law in LAWS.items():
+        extra: dict[str, Any] = {"unit_label": law.label}
+        note = ""
+        if law.tau_ref_hours is not None:
+            extra["tau_ref"] = f"{law.tau_ref_hours:g} h"
+            note = f", stored as the Allan deviation of its term at tau = {law.tau_ref_hours:g} h (numerically {symbol} in {law.label})"
+        base = {"units": law.units, **extra}
+        VARIABLES[symbol] = {"long_name": f"{law.name} coefficient{note}", **base}
+        VARIABLES[f"{symbol}_stderr"] = {"long_name": f"standard error of the {law.name} coefficient{note}", **base}
+        VARIABLES[f"{symbol}_upper"] = {"long_name": f"95 % upper limit of the {law.name} coefficient{note}", **base}
+        if symbol in "NK":
+            VARIABLES[f"{symbol}_squared"] = {"long_name": f"square of the {law.name} coefficient", "units": law.squared_units}
+
+
+_add_coefficients()
+
+
+def attributes(name: str) -> dict[str, Any]:
+    """A fresh copy of the attributes of a product variable."""
+    return dict(VARIABLES[name])
+
+
+def signal_name(log: xr.Dataset) -> str:
+    """``"rate"`` or ``"angle"``: which gyro signal the dataset holds.
+
+    Raises
+    ------
+    SchemaError
+        When it holds neither, or both.
+    """
+    found = [name for name in SIGNAL_UNITS if name in log.data_vars]
+    if len(found) != 1:
+        raise SchemaError(f"a log holds either 'rate' or 'angle'; this dataset holds {found or sorted(map(str, log.data_vars))}")
+    return found[0]
+
+
+def log_channels(log: xr.Dataset) -> list[str]:
+    """Names of the channels of a log: one-dimensional variables on ``time`` or on their own ``time_<channel>``."""
+    return [str(name) for name, variable in log.data_vars.items() if variable.dims in (("time",), (f"time_{name}",))]
+
+
+def _require(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -> None:
+    for name, expected in dims.items():
+        if name not in dataset.variables:
+            raise SchemaError(f"this is not a {what}: it has no variable {name!r}; it has {sorted(map(str, dataset.variables))}")
+        if dataset[name].dims != expected:
+            raise SchemaError(f"{what}: variable {name!r} has dimensions {dataset[name].dims}, expected {expected}; transpose or rename them")
+
+
+def check_raw(raw: xr.Dataset) -> None:
+    """Raise `SchemaError` unless `raw` is what a reader returns (see `gyrostab.read`)."""
+    name = signal_name(raw)
+    _require(raw, "raw log", {name: ("axis", "row")})
+    _check_units(raw, name)
+
+
+def check_log(log: xr.Dataset) -> None:
+    """Raise `SchemaError` unless `log` is a regular log: uniform ``time``, a signal ``(axis, time)`` with units, a rate."""
+    if "row" in log.dims:
+        raise SchemaError("these are raw rows with their stamps as written; call gyrostab.regularise(raw) first")
+    name = signal_name(log)
+    _require(log, "log", {name: ("axis", "time"), "time": ("time",)})
+    _check_units(log, name)
+    if log.sizes["axis"] == 0 or log.sizes["time"] == 0:
+        raise SchemaError("the log is empty: it has no axis or no sample")
+    rate = log.attrs.get("sampling_rate_hz")
+    if rate is None or not np.isfinite(rate) or rate <= 0:
+        raise SchemaError(f"the log needs the attribute 'sampling_rate_hz' in Hz, a number above 0; it has {rate!r}")
+
+
+def _check_units(dataset: xr.Dataset, name: str) -> None:
+    units = dataset[name].attrs.get("units")
+    if units != SIGNAL_UNITS[name]:
+        raise SchemaError(f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; readers convert, arrays must say their unit")
+
+
+def check_surface(surface: xr.Dataset) -> None:
+    """Raise `SchemaError` unless `surface` is what `gyrostab.davar` returns."""
+    cube = ("axis", "time", "tau")
+    _require(surface, "DAVAR surface", dict.fromkeys(("avar", "count", "coverage", "edf", "estimator"), cube))
+    _require(surface, "DAVAR surface", dict.fromkeys(("window_mean", "window_coverage"), cube[:2]))
+
+
+def check_product(product: xr.Dataset) -> None:
+    """Raise `SchemaError` unless `product` is what `gyrostab.fit_noise` returns."""
+    check_surface(product)
+    _require(product, "product", {**dict.fromkeys(TERMS, ("axis", "time")), "observable": ("axis", "time", "term")})

@@ -1,0 +1,206 @@
+"""A uniform time axis that is computed, not stored: ``start + round(n * 1e9 / rate)`` nanoseconds.
+
+Every stamp comes from its integer index, so nothing drifts: the rate is taken as the exact decimal that is written
+(99.3 Hz is 993/10 Hz), the whole nanoseconds of the period are multiplied as integers and only the fraction below one
+nanosecond as a float. 200 h at 300 Hz end on the right nanosecond, and the axis of such a log takes no memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+from xarray.core.indexing import IndexSelResult
+from xarray.indexes import CoordinateTransform, CoordinateTransformIndex
+
+__all__ = ["TimeGridIndex", "grid_index", "grid_times", "period_ns", "time_coordinate"]
+
+NANOSECONDS = 10**9
+
+
+def period_ns(rate: float) -> tuple[int, float]:
+    """Whole and fractional nanoseconds of the sampling period of `rate` [Hz].
+
+    Examples
+    --------
+    >>> period_ns(400.0)
+    (2500000, 0.0)
+    >>> period_ns(300.0)
+    (3333333, 0.3333333333333333)
+    """
+    period = NANOSECONDS / Fraction(repr(float(rate)))
+    whole = int(period)
+    return whole, float(period - whole)
+
+
+def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
+    """Stamps [ns since 1970] of the samples `index` (integers, any shape) of a grid.
+
+    Parameters
+    ----------
+    start : int
+        Stamp of sample 0 [ns since 1970-01-01T00:00:00].
+    rate : float
+        Sampling rate [Hz].
+    index : array_like of int
+        Sample numbers.
+
+    Examples
+    --------
+    >>> int(grid_times(0, 300.0, 200 * 3600 * 300))  # 200 h at 300 Hz, to the nanosecond
+    720000000000000
+    """
+    index = np.asarray(index, dtype=np.int64)
+    whole, fraction = period_ns(rate)
+    return np.asarray(start + index * whole + np.rint(index * fraction).astype(np.int64))
+
+
+def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
+    """Position on the grid, in samples and fractions of one, of `stamps` [ns since 1970]."""
+    whole, fraction = period_ns(rate)
+    return np.asarray((np.asarray(stamps, dtype=np.int64) - start) / (whole + fraction))
+
+
+class _GridTransform(CoordinateTransform):
+    """Sample position -> stamp, for sample ``first + stride * position`` of a grid."""
+
+    def __init__(self, start: int, rate: float, size: int, *, first: int = 0, stride: int = 1, name: str = "time", dim: str = "time"):
+        super().__init__([name], {dim: size}, dtype=np.dtype("datetime64[ns]"))
+        self.start, self.rate, self.first, self.stride = int(start), float(rate), int(first), int(stride)
+
+    @property
+    def size(self) -> int:
+        return int(next(iter(self.dim_size.values())))
+
+    def forward(self, dim_positions: dict[str, Any]) -> dict[Any, Any]:
+        position = np.asarray(dim_positions[self.dims[0]], dtype=np.int64)
+        stamps = grid_times(self.start, self.rate, self.first + self.stride * position)
+        return {self.coord_names[0]: stamps.view("datetime64[ns]")}
+
+    def reverse(self, coord_labels: dict[Any, Any]) -> dict[str, Any]:
+        stamps = np.asarray(coord_labels[self.coord_names[0]]).astype("datetime64[ns]").view(np.int64)
+        return {self.dims[0]: (grid_index(self.start, self.rate, stamps) - self.first) / self.stride}
+
+    def equals(self, other: CoordinateTransform, *, exclude: frozenset[Any] | None = None) -> bool:
+        return isinstance(other, _GridTransform) and self._key() == other._key()
+
+    def _key(self) -> tuple[Any, ...]:
+        return (self.start, self.rate, self.first, self.stride, self.size)
+
+    def cut(self, part: slice) -> _GridTransform:
+        chosen = range(self.size)[part]
+        return _GridTransform(
+            self.start,
+            self.rate,
+            len(chosen),
+            first=self.first + self.stride * chosen.start,
+            stride=self.stride * chosen.step,
+            name=str(self.coord_names[0]),
+            dim=self.dims[0],
+        )
+
+
+class TimeGridIndex(CoordinateTransformIndex):
+    """xarray index over a uniform time axis: slices stay lazy, labels select by arithmetic instead of by search."""
+
+    transform: _GridTransform
+
+    @property
+    def start(self) -> int:
+        """Stamp of the first sample [ns since 1970]."""
+        return int(grid_times(self.transform.start, self.transform.rate, self.transform.first))
+
+    @property
+    def rate(self) -> float:
+        """Sampling rate [Hz]."""
+        return self.transform.rate / self.transform.stride
+
+    def isel(self, indexers: Mapping[Any, Any]) -> TimeGridIndex | None:
+        part = indexers[self.transform.dims[0]]
+        return type(self)(self.transform.cut(part)) if isinstance(part, slice) else None
+
+    def sel(self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None) -> IndexSelResult:
+        (name,) = self.transform.coord_names
+        label = labels[name]
+        dim = self.transform.dims[0]
+        if isinstance(label, slice):
+            return IndexSelResult({dim: self._slice(label)})
+        if isinstance(label, str) and method is None and len(label) < len("2000-01-01T00:00:00"):
+            period = pd.Period(label)  # "2026-11-20" or "2026-11-20T14": the whole day or hour, as pandas does
+            return IndexSelResult({dim: self._slice(slice(period.start_time, period.end_time))})
+        stamps = np.asarray(getattr(label, "values", label)).astype("datetime64[ns]")
+        position = self.transform.reverse({name: stamps})[dim]
+        nearest = np.rint(position).astype(np.int64)
+        if method not in (None, "nearest"):
+            raise ValueError(f"a uniform time axis selects with method='nearest' or exactly, not {method!r}")
+        outside = (nearest < 0) | (nearest >= self.transform.size)
+        if method is None:
+            exact = self.transform.forward({dim: nearest})[name] == stamps
+            if np.any(outside | ~exact):
+                raise KeyError(f"no sample exactly at {label}; use method='nearest' or a slice")
+        nearest = np.clip(nearest, 0, self.transform.size - 1)
+        if tolerance is not None:
+            miss = np.abs(self.transform.forward({dim: nearest})[name] - stamps)
+            if np.any(miss > np.timedelta64(pd.Timedelta(tolerance))):
+                raise KeyError(f"no sample within {tolerance} of {label}")
+        if isinstance(label, xr.DataArray | xr.Variable):
+            return IndexSelResult({dim: xr.Variable(label.dims, nearest)})
+        return IndexSelResult({dim: int(nearest) if nearest.ndim == 0 else nearest})
+
+    def _slice(self, label: slice) -> slice:
+        (name,), (dim,) = self.transform.coord_names, self.transform.dims
+
+        def edge(bound: Any, side: str) -> int | None:
+            if bound is None:
+                return None
+            stamp = pd.Period(bound).end_time if side == "right" and isinstance(bound, str) and len(bound) < 19 else pd.Timestamp(bound)
+            stamp = stamp.tz_convert(None) if stamp.tzinfo else stamp
+            guess = int(np.floor(self.transform.reverse({name: np.datetime64(stamp)})[dim])) - 1
+            while guess < self.transform.size:  # at most three steps: the guess is off by rounding only
+                here = self.transform.forward({dim: guess})[name]
+                if here > np.datetime64(stamp) or (here == np.datetime64(stamp) and side == "left"):
+                    break
+                guess += 1
+            return max(0, min(guess, self.transform.size))
+
+        return slice(edge(label.start, "left"), edge(label.stop, "right"), label.step)
+
+    def to_pandas_index(self) -> pd.Index:
+        (dim,) = self.transform.dims
+        return pd.DatetimeIndex(self.transform.generate_coords()[self.transform.coord_names[0]], name=dim)
+
+
+def time_coordinate(start: int, rate: float, size: int, *, name: str = "time") -> xr.Coordinates:
+    """Lazy, exact, uniform time coordinate.
+
+    Parameters
+    ----------
+    start : int
+        Stamp of the first sample [ns since 1970-01-01T00:00:00].
+    rate : float
+        Sampling rate [Hz], taken as the decimal number that it prints as.
+    size : int
+        Number of samples.
+    name : str
+        Name of the coordinate and of its dimension.
+
+    Returns
+    -------
+    xarray.Coordinates
+        To be given to ``xr.Dataset(..., coords=...)``; no stamp is held in memory.
+
+    Examples
+    --------
+    >>> log = xr.Dataset(coords=time_coordinate(0, 400.0, 3 * 10**8))
+    >>> log.time[-1].values
+    np.datetime64('1970-01-09T16:19:59.997500000')
+    >>> log.isel(time=slice(0, 4, 2)).time.values
+    array(['1970-01-01T00:00:00.000000000', '1970-01-01T00:00:00.005000000'],
+          dtype='datetime64[ns]')
+    """
+    return xr.Coordinates.from_xindex(TimeGridIndex(_GridTransform(start, rate, size, name=name, dim=name)))
