@@ -1,0 +1,25 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Callable[[str], Path]:
+    """Path of a real recording, or a skip that says where it was looked for."""
+    base = Path(os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings"))
+
+    def find(name: str) -> Path:
+        path = base / name
+        if not path.exists():
+            pytest.skip(f"real recording {name} is not in {base} (set GYROSTAB_RECORDINGS to its directory)")
+        return path
+
+    return find
