@@ -1,1 +1,92 @@
-"""gyrostab: gyro logs to dynamic Allan variance and time-varying noise coefficients."""
+"""gyrostab: gyro logs to dynamic Allan variance and time-varying noise coefficients.
+
+>>> import gyrostab
+>>> raw = gyrostab.read_log("tool.csv")                      # doctest: +SKIP
+>>> log = gyrostab.regularise(raw)                           # doctest: +SKIP
+>>> surface = gyrostab.davar(log, window="10min")            # doctest: +SKIP
+>>> product = gyrostab.fit_noise(surface)                    # doctest: +SKIP
+>>> gyrostab.to_netcdf(product, "product.nc")                # doctest: +SKIP
+
+Every public name is loaded when it is first used, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gyrostab.davar import davar as davar
+    from gyrostab.export import open_product as open_product
+    from gyrostab.export import to_netcdf as to_netcdf
+    from gyrostab.fit import fit_noise as fit_noise
+    from gyrostab.plot import plot_coefficients as plot_coefficients
+    from gyrostab.plot import plot_davar as plot_davar
+    from gyrostab.plot import plot_davar_3d as plot_davar_3d
+    from gyrostab.plot import plot_signal as plot_signal
+    from gyrostab.read import read_log as read_log
+    from gyrostab.regularise import gap_table as gap_table
+    from gyrostab.regularise import regularise as regularise
+    from gyrostab.report import write_report as write_report
+    from gyrostab.scan import scan as scan
+
+# public name -> module that holds it
+_HOME = {
+    "davar": "davar",
+    "fit_noise": "fit",
+    "gap_table": "regularise",
+    "open_product": "export",
+    "plot_coefficients": "plot",
+    "plot_davar": "plot",
+    "plot_davar_3d": "plot",
+    "plot_signal": "plot",
+    "read_log": "read",
+    "regularise": "regularise",
+    "scan": "scan",
+    "to_netcdf": "export",
+    "write_report": "report",
+}
+
+__all__ = [
+    "__version__",
+    "davar",
+    "fit_noise",
+    "gap_table",
+    "open_product",
+    "plot_coefficients",
+    "plot_davar",
+    "plot_davar_3d",
+    "plot_signal",
+    "read_log",
+    "regularise",
+    "scan",
+    "to_netcdf",
+    "write_report",
+]
+
+
+class _Package(ModuleType):
+    """Keeps ``gyrostab.davar`` the function when Python would bind the module of the same name on its import."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("gyrostab")
+    if name in _HOME:
+        return getattr(importlib.import_module(f"gyrostab.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'gyrostab' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
