@@ -1,0 +1,467 @@
+"""The command line: parse, call, print.
+
+Exit codes: 0 done; 2 bad input or usage, with one message on stderr; 3 interrupted; 1 anything else. No traceback unless ``--debug``.
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts.validators import Number
+
+from gyrostab.errors import GyrostabError, OptionError
+
+__all__ = ["app", "main"]
+
+_READING = Group("Reading options", sort_key=1)
+_WINDOWS = Group("Analysis options", sort_key=2)
+_COMMON = Group("Common options", sort_key=3)
+Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
+
+
+@Parameter(name="*", group=_READING)
+@dataclass(frozen=True)
+class Reading:
+    """How a log is to be read where it does not say so itself.
+
+    Parameters
+    ----------
+    rate
+        Sampling rate in Hz, for a log without a time column (otherwise the rate is found from the time stamps and checked against this).
+    start
+        Time of the first row, for a log without a time column: 2026-11-20T14:00:00.
+    epoch
+        Day from which a time column in seconds counts: 2026-11-20 (default 1970-01-01).
+    map
+        Rename a column: wx=gyro_x. Repeat for more columns, or give a TOML file with one line per column: wx = "gyro_x".
+    unit
+        Unit of a column that has none: gyro=deg/s, gyro_x=deg/s, temperature=degC; of counts: "gyro=0.1 arcsec/s". Repeat for more.
+    kind
+        Whether the gyro columns are rotation rates or angles.
+    channel
+        Another file with a channel (temperature, vibration ...) of the same time. Repeat for more.
+    """
+
+    rate: Annotated[float | None, Parameter(metavar="HZ")] = None
+    start: Annotated[str | None, Parameter(metavar="TIME")] = None
+    epoch: Annotated[str | None, Parameter(metavar="TIME")] = None
+    map: Annotated[list[str] | None, Parameter(metavar="HEADER=NAME", negative=())] = None
+    unit: Annotated[list[str] | None, Parameter(metavar="NAME=UNIT", negative=())] = None
+    kind: Literal["rate", "angle"] | None = None
+    channel: Annotated[list[Path] | None, Parameter(metavar="FILE", negative=())] = None
+
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `gyrostab.read.read_log`."""
+        chosen = {
+            **asdict(self),
+            "map": _pairs(self.map, "--map"),
+            "unit": _pairs(self.unit, "--unit"),
+            "channel": tuple(self.channel or ()),
+        }
+        return {name: value for name, value in chosen.items() if value not in (None, (), {})}
+
+
+@Parameter(name="*", group=_WINDOWS)
+@dataclass(frozen=True)
+class Windows:
+    """The sliding window of the dynamic Allan variance.
+
+    Parameters
+    ----------
+    window
+        Length of the sliding window: 10min, 500ms, 2h or 2000samples.
+    step
+        Distance from one window to the next, in the same manner (default: the window itself is a whole number of steps, see the manual).
+    taus
+        Averaging times: how many (40, spread evenly on a logarithmic scale), octave (1, 2, 4 ... samples), all, or a list: 0.1s,1s,10s.
+    tau_max
+        Longest averaging time (default: a third of the window).
+    axis
+        Only this gyro axis: x. Repeat for more.
+    """
+
+    window: Annotated[str, Parameter(metavar="DURATION")] = "10min"
+    step: Annotated[str | None, Parameter(metavar="DURATION")] = None
+    taus: Annotated[str, Parameter(metavar="LIST")] = "40"
+    tau_max: Annotated[str | None, Parameter(metavar="DURATION")] = None
+    axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None
+
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `gyrostab.davar.davar`."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@Parameter(name="*", group=_COMMON)
+@dataclass(frozen=True)
+class Common:
+    """What every command takes.
+
+    Parameters
+    ----------
+    config
+        TOML file with defaults for the options: [run] window = "10min".
+    workers
+        Processor cores to use (default: all).
+    overwrite
+        Replace an output that exists.
+    quiet_progress
+        Show no progress.
+    debug
+        Show where in the program an error arose.
+    """
+
+    config: Annotated[Path | None, Parameter(metavar="FILE.toml")] = None
+    workers: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=1))] = None
+    overwrite: Flag = False
+    quiet_progress: Flag = False
+    debug: Flag = False
+
+
+Logs = Annotated[list[Path], Parameter(name="LOG...", negative=())]
+Log = Annotated[Path, Parameter(name="LOG")]
+Output = Annotated[Path, Parameter(name=["--output", "-o"], metavar="FILE")]
+
+app = App(
+    name="gyrostab",
+    help="Dynamic Allan variance of gyro logs: from raw logs of drilling tools to noise coefficients that vary with time.",
+    help_epilogue="First try: gyrostab demo -o demo-output. Each command explains itself: gyrostab run --help.",
+    version_flags=["--version"],
+    help_format="plaintext",
+    suppress_keyboard_interrupt=False,
+)
+
+
+def _pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
+    """``["wx=gyro_x"]`` as a dict; an item may also name a TOML file of such pairs."""
+    found: dict[str, str] = {}
+    for item in items or ():
+        name, equals, value = item.partition("=")
+        if equals and name.strip() and value.strip():
+            found[name.strip()] = value.strip()
+        elif item.endswith(".toml"):
+            found.update({key: str(value) for key, value in _read_toml(Path(item)).items()})
+        else:
+            raise OptionError(f"{option} {item!r}: write NAME=VALUE, for instance {option} {_PAIR_EXAMPLES[option]}")
+    return found
+
+
+_PAIR_EXAMPLES = {"--map": "wx=gyro_x", "--unit": "gyro=deg/s"}
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise OptionError(f"{path}: not a TOML file ({error})") from error
+
+
+@contextmanager
+def _work(common: Common) -> Iterator[Any]:
+    """Set the number of cores, and show the stages of the work."""
+    import dask
+
+    from gyrostab.progress import show_progress
+
+    chosen = {"num_workers": common.workers} if common.workers else {}
+    with dask.config.set(scheduler="threads", **chosen), show_progress(quiet=common.quiet_progress) as stage:
+        yield stage
+
+
+@app.command(sort_key=0, help_epilogue="")
+def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -> None:
+    """Run the main job on the simulated log that comes with gyrostab.
+
+    Writes the product, the regular log, a report and figures into a folder, and prints the noise coefficients
+    before, during and after the vibration.
+
+    Example: gyrostab demo -o demo-output
+
+    Parameters
+    ----------
+    output
+        Folder to write into.
+    """
+    from gyrostab.demo import format_summary, run_demo
+
+    with _work(common) as stage:
+        summary, files = run_demo(output, overwrite=common.overwrite, stage=stage)
+    print(format_summary(summary))
+    print("\nwritten:", *(f"  {file}" for file in files), sep="\n")
+
+
+@app.command(sort_key=1, help_epilogue="")
+def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common()) -> None:
+    """Say what is in some logs: span, sampling rate, axes, channels, gaps, and what is odd.
+
+    Example: gyrostab scan run7/*.csv
+
+    Parameters
+    ----------
+    logs
+        One or more logs, in any format that gyrostab reads.
+    """
+    from gyrostab.scan import print_scan
+    from gyrostab.scan import scan as scan_logs
+
+    print_scan(scan_logs(logs, **reading.options()))
+
+
+@app.command(sort_key=2, help_epilogue="")
+def ingest(logs: Logs, /, *, output: Output, max_gap: str = "10D", reading: Reading = Reading(), common: Common = Common()) -> None:
+    """Put logs on one uniform time axis, with the gaps marked, and write them as NetCDF or Zarr.
+
+    Example: gyrostab ingest run7/*.csv -o run7.nc
+
+    Parameters
+    ----------
+    logs
+        One or more logs, in any order.
+    output
+        File to write, LOG.nc or LOG.zarr.
+    max_gap
+        Longest gap to bridge; a longer one is taken for a wrong clock.
+    """
+    from gyrostab.export import to_netcdf, to_zarr
+    from gyrostab.run import check_output, load_log, samples_of
+
+    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite, inputs=logs)
+    with _work(common) as stage:
+        stage("reading", 0)
+        log = load_log(logs, max_gap=max_gap, **reading.options())
+        stage("writing", samples_of(log))
+        write = to_zarr if target.suffix == ".zarr" else to_netcdf
+        write(log, target, overwrite=common.overwrite)
+    print(target)
+
+
+@app.command(sort_key=3, help_epilogue="")
+def run(
+    logs: Logs,
+    /,
+    *,
+    output: Output,
+    windows: Windows = Windows(),
+    reading: Reading = Reading(),
+    common: Common = Common(),
+) -> None:
+    """Go the whole way from logs to the product: uniform time, dynamic Allan variance, noise coefficients, NetCDF.
+
+    The log may be larger than the memory. Example:
+    gyrostab run run7/*.csv -o product.nc --window 10min --step 1min
+
+    Parameters
+    ----------
+    logs
+        One or more logs, in any order.
+    output
+        NetCDF file to write.
+    """
+    from gyrostab.run import run as run_job
+
+    with _work(common) as stage:
+        target = run_job(logs, output, reading=reading.options(), windows=windows.options(), overwrite=common.overwrite, stage=stage)
+    print(target)
+
+
+@app.command(sort_key=4, help_epilogue="")
+def davar(log: Log, /, *, output: Output, windows: Windows = Windows(), common: Common = Common()) -> None:
+    """Compute the dynamic Allan variance of a log.
+
+    Example: gyrostab davar run7.nc -o davar.nc --window 10min --step 1min
+
+    Parameters
+    ----------
+    log
+        Log that gyrostab ingest wrote.
+    output
+        NetCDF file to write.
+    """
+    from gyrostab.davar import davar as compute
+    from gyrostab.export import open_log, to_netcdf
+    from gyrostab.run import check_output, samples_of
+
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[log])
+    with _work(common) as stage:
+        dataset = open_log(log)
+        stage("computing", samples_of(dataset))
+        to_netcdf(compute(dataset, **windows.options()), target, overwrite=common.overwrite)
+    print(target)
+
+
+@app.command(sort_key=5, help_epilogue="")
+def fit(
+    surface: Annotated[Path, Parameter(name="DAVAR")],
+    /,
+    *,
+    output: Output,
+    terms: str = "QNBKR",
+    method: Literal["gls", "adev"] = "gls",
+    common: Common = Common(),
+) -> None:
+    """Fit the noise coefficients Q, N, B, K and R in every window of a dynamic Allan variance.
+
+    Example: gyrostab fit davar.nc -o product.nc
+
+    Parameters
+    ----------
+    surface
+        File that gyrostab davar wrote.
+    output
+        NetCDF file to write.
+    terms
+        Terms of the model, letters of QNBKR.
+    method
+        gls fits variances with their covariance; adev fits deviations, as some papers do, for comparison.
+    """
+    from gyrostab.export import open_product, to_netcdf
+    from gyrostab.fit import fit_noise
+    from gyrostab.run import check_output
+
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[surface])
+    with _work(common) as stage:
+        stage("fitting", 0)
+        to_netcdf(fit_noise(open_product(surface), terms=terms, method=method), target, overwrite=common.overwrite)
+    print(target)
+
+
+@app.command(sort_key=6, help_epilogue="")
+def report(
+    product: Annotated[Path, Parameter(name="PRODUCT")],
+    /,
+    *,
+    output: Output,
+    log: Path | None = None,
+    common: Common = Common(),
+) -> None:
+    """Make one self-contained HTML page of a product, with figures.
+
+    Example: gyrostab report product.nc -o report.html --log run7.nc
+
+    Parameters
+    ----------
+    product
+        File that gyrostab run or gyrostab fit wrote.
+    output
+        HTML file to write.
+    log
+        Log that the product was made of, to show the signal too.
+    """
+    from gyrostab.export import open_log, open_product
+    from gyrostab.report import write_report
+    from gyrostab.run import check_output
+
+    target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite, inputs=[product])
+    with _work(common) as stage:
+        stage("drawing", 0)
+        write_report(open_product(product), target, log=open_log(log) if log else None, overwrite=common.overwrite)
+    print(target)
+
+
+def _config(tokens: Sequence[str]) -> Any:
+    """Reader of the option defaults in the file that ``--config`` names, for cyclopts; None without one."""
+    name = None
+    for place, token in enumerate(tokens):
+        if token == "--config" and place + 1 < len(tokens):
+            name = tokens[place + 1]
+        elif token.startswith("--config="):
+            name = token.removeprefix("--config=")
+    if name is None:
+        return None
+    table = _read_toml(Path(name))
+    commands = [command for command in app if not command.startswith("-")]
+    strange = [key for key, value in table.items() if isinstance(value, dict) and key not in commands]
+    if strange:
+        raise OptionError(f"{name}: table [{strange[0]}] is not a command; the commands are {', '.join(commands)}")
+
+    def apply(current: Any, path: tuple[str, ...], arguments: Any) -> None:
+        from cyclopts.config import Dict
+
+        defaults = {key: value for key, value in table.items() if not isinstance(value, dict)}
+        defaults |= table.get(path[0], {}) if path else {}
+        for key, value in defaults.items():
+            if isinstance(value, dict):  # [run.map] wx = "gyro_x"
+                defaults[key] = [f"{left}={right}" for left, right in value.items()]
+        Dict(defaults, source=name, use_commands_as_keys=False)(current, path, arguments)
+
+    return apply
+
+
+@contextmanager
+def _notes() -> Iterator[None]:
+    """Show each warning of the package once, as one plain line."""
+    seen: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], filename: str, lineno: int, *rest: Any) -> None:
+        text = str(message)
+        if text not in seen:
+            seen.add(text)
+            print(f"note: {text}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = show
+        yield
+
+
+def _complain(text: str, code: int) -> int:
+    print(f"gyrostab: {text}", file=sys.stderr)
+    return code
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Arguments after the program's name; those of the process when absent.
+
+    Returns
+    -------
+    int
+        Exit code.
+
+    Examples
+    --------
+    >>> main(["fit", "davar.nc"])
+    2
+    """
+    tokens = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in tokens
+    try:
+        app.config = _config(tokens)
+        with _notes():
+            app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+    except KeyboardInterrupt:
+        return _complain("interrupted; nothing was written under the name of the output. Start the same command again.", 3)
+    except BrokenPipeError:  # the reader of our output, for instance `head`, has left
+        sys.stderr.close()
+        return 0
+    except Exception as error:
+        if debug:
+            raise
+        return _explain(error)
+    return 0
+
+
+def _explain(error: Exception) -> int:
+    """One message for an error, and the exit code."""
+    if isinstance(error, CycloptsError):
+        return _complain(f"{error} See gyrostab --help, or the command's own --help.", 2)
+    if isinstance(error, GyrostabError):
+        return _complain(str(error), 2)
+    if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError) and error.filename:
+        return _complain(f"{error.filename}: {error.strerror}", 2)
+    if isinstance(error, MemoryError):
+        return _complain(f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers", 1)
+    return _complain(f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.", 1)

@@ -1,0 +1,188 @@
+"""The main job on the simulated log that is shipped: a gyro on a shaker, still, vibrating, still again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyrostab.errors import OutputError, SchemaError
+from gyrostab.progress import Stage, no_stage
+from gyrostab.run import load_log, samples_of
+
+__all__ = ["find_parts", "format_summary", "run_demo", "sample_log", "summarise"]
+
+WINDOW, STEP = "60s", "10s"
+FILES = ("product.nc", "log.nc", "report.html", "signal.png", "davar.png", "davar_3d.png", "coefficients.png")
+
+
+def sample_log() -> Path:
+    """Find the shipped log: inside an installed package, or in ``data/`` of a source tree.
+
+    Examples
+    --------
+    >>> sample_log().name
+    'mwd_sample.csv.gz'
+    """
+    here = Path(__file__).resolve().parent
+    for folder in (here / "data", here.parent / "data"):
+        path = folder / "mwd_sample.csv.gz"
+        if path.exists():
+            return path
+    raise OutputError(f"the shipped log mwd_sample.csv.gz is missing from {here / 'data'}; install gyrostab again")
+
+
+def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Timestamp]]:
+    """Find the parts of an on/off vibration test from the vibration channel.
+
+    Parameters
+    ----------
+    vibration : xarray.DataArray
+        Rms acceleration [g] by its own time.
+
+    Returns
+    -------
+    dict
+        ``still``, ``vibrating`` and ``after``: first and last stamp [UTC] that surely lie in the part.
+
+    Raises
+    ------
+    SchemaError
+        When the channel never rises, or rises before its first or after its last sample.
+
+    Examples
+    --------
+    >>> time = pd.date_range("2026-03-14", periods=9, freq="1s")
+    >>> parts = find_parts(xr.DataArray([0, 0, 0, 9, np.nan, 9, 0, 0, 0], {"t": time}, ["t"]))
+    >>> [str(stamp.time()) for stamp in parts["vibrating"]]
+    ['00:00:03', '00:00:05']
+    """
+    (dim,) = vibration.dims
+    known = vibration[np.isfinite(vibration.values)]
+    stamps, level = pd.DatetimeIndex(known[dim].values), known.values
+    shaken = np.flatnonzero(level > 0.5 * level.max()) if level.size else np.array([], dtype=int)
+    if shaken.size == 0 or shaken[0] == 0 or shaken[-1] == level.size - 1:
+        raise SchemaError("the channel 'vibration' does not rise and fall again within the log; no parts can be told apart")
+    first, last = int(shaken[0]), int(shaken[-1])
+    return {
+        "still": (stamps[0], stamps[first - 1]),
+        "vibrating": (stamps[first], stamps[last]),
+        "after": (stamps[last + 1], stamps[-1]),
+    }
+
+
+def summarise(product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Timestamp]], *, window: str = WINDOW) -> pd.DataFrame:
+    """Tabulate the coefficients of each part, over the windows that lie wholly in it.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of `gyrostab.fit_noise`.
+    parts : dict
+        Name to first and last stamp, as `find_parts` gives them.
+    window : str
+        Length of the product's windows.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per axis and term: axis, term, unit, and one column of text per part: the median where most windows observe the term,
+        ``< x`` with the median of the upper limits where most do not.
+    """
+    from gyrostab.noise import LAWS
+
+    half = pd.Timedelta(window) / 2
+    centre = pd.DatetimeIndex(product["time"].values)
+    rows = []
+    for axis in product["axis"].values:
+        for symbol, law in LAWS.items():
+            row = {"axis": str(axis), "term": symbol, "unit": law.label}
+            for name, (start, end) in parts.items():
+                inside = (centre - half >= start) & (centre + half <= end)
+                row[name] = _one_cell(product.sel(axis=axis).isel(time=np.flatnonzero(inside)), symbol)
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _one_cell(part: xr.Dataset, symbol: str) -> str:
+    flags = part["observable"].sel(term=symbol).values
+    if flags.size and np.mean(flags == 2) > 0.5:
+        return f"{np.median(part[symbol].values[flags == 2]):.3g}"
+    upper = part[f"{symbol}_upper"].values
+    upper = upper[np.isfinite(upper)]
+    return f"< {np.median(upper):.2g}" if upper.size else "-"
+
+
+def format_summary(summary: pd.DataFrame) -> str:
+    """Lay the table of `summarise` out as text."""
+    return (
+        f"Noise coefficients, medians over the windows of {WINDOW} wholly in each part (< x: not observable, 95 % upper limit)\n\n"
+        + summary.to_string(index=False, justify="right")
+    )
+
+
+def run_demo(folder: str | Path, *, overwrite: bool = False, stage: Stage = no_stage) -> tuple[pd.DataFrame, list[Path]]:
+    """Run the main job on the shipped log.
+
+    Parameters
+    ----------
+    folder : path
+        Where to write; it is made when it does not exist.
+    overwrite : bool
+        Whether files of an earlier run may be replaced.
+    stage : callable
+        Told the name of each stage as it begins, and its number of samples.
+
+    Returns
+    -------
+    pandas.DataFrame, list of Path
+        The table of `summarise` and the files written.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be written to, or holds one of the files and `overwrite` is not given.
+    """
+    from gyrostab.davar import davar
+    from gyrostab.export import to_netcdf
+    from gyrostab.fit import fit_noise
+    from gyrostab.report import write_report
+
+    files = _prepare(Path(folder), overwrite=overwrite)
+    stage("reading", 0)
+    log = load_log([sample_log()])
+    parts = find_parts(log["vibration"])
+    to_netcdf(log, files["log.nc"], overwrite=overwrite)
+    stage("computing", samples_of(log))
+    product = fit_noise(davar(log, window=WINDOW, step=STEP)).compute()
+    to_netcdf(product, files["product.nc"], overwrite=overwrite)
+    stage("drawing", 0)
+    _draw(log, product, files)
+    write_report(product, files["report.html"], log=log, overwrite=overwrite)
+    return summarise(product, parts), list(files.values())
+
+
+def _prepare(folder: Path, *, overwrite: bool) -> dict[str, Path]:
+    from gyrostab.run import check_output
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"folder {str(folder)!r} cannot be made ({error.strerror}); give another one with -o") from error
+    return {name: check_output(folder / name, overwrite=overwrite) for name in FILES}
+
+
+def _draw(log: xr.Dataset, product: xr.Dataset, files: dict[str, Path]) -> None:
+    from gyrostab.plot import plot_coefficients, plot_davar, plot_davar_3d, plot_signal
+
+    axis = str(product["axis"].values[0])
+    figures = {
+        "signal.png": plot_signal(log),
+        "davar.png": plot_davar(product),
+        "davar_3d.png": plot_davar_3d(product, axis=axis),
+        "coefficients.png": plot_coefficients(product),
+    }
+    for name, figure in figures.items():
+        figure.savefig(files[name], dpi=120)

@@ -1,0 +1,138 @@
+"""The main job, composed of the stages: logs -> regular log -> dynamic Allan variance -> coefficients -> NetCDF."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from gyrostab.errors import OptionError, OutputError
+from gyrostab.progress import Stage, no_stage
+
+__all__ = ["check_output", "load_log", "run", "samples_of"]
+
+
+def check_output(path: str | Path, *, suffixes: Sequence[str] = (), overwrite: bool = False, inputs: Iterable[str | Path] = ()) -> Path:
+    """Make sure, before the long work starts, that a result can be written.
+
+    Parameters
+    ----------
+    path : str or Path
+        File (or Zarr folder) to be written.
+    suffixes : sequence of str
+        Endings that the stage can write, with the dot; empty for any.
+    overwrite : bool
+        Whether an existing output may be replaced.
+    inputs : iterable of path
+        Files that are read, which the output must not replace.
+
+    Returns
+    -------
+    Path
+        The path.
+
+    Raises
+    ------
+    OptionError
+        When the name has the wrong ending, or is an input.
+    OutputError
+        When the output exists and `overwrite` is not given, or its folder cannot be written to.
+
+    Examples
+    --------
+    >>> check_output("product.txt", suffixes=[".nc"])
+    Traceback (most recent call last):
+    gyrostab.errors.OptionError: output 'product.txt' must end in .nc; give another name with -o
+    """
+    path = Path(path)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise OptionError(f"output {str(path)!r} must end in {' or '.join(suffixes)}; give another name with -o")
+    if any(Path(item).resolve() == path.resolve() for item in inputs):
+        raise OptionError(f"output {str(path)!r} is also an input and would be destroyed; give another name with -o")
+    if path.exists() and not overwrite:
+        raise OutputError(f"output {str(path)!r} exists already; give --overwrite to replace it, or another name with -o")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise OutputError(f"output {str(path)!r}: nothing can be written in {str(path.parent)!r} ({error.strerror})") from error
+    return path
+
+
+def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: Any) -> xr.Dataset:
+    """Read logs in any format and put them on a uniform time axis.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Files, in any order; one NetCDF or Zarr log that gyrostab wrote is opened as it is, without loading it.
+    max_gap : str
+        Longest gap that is filled with missing samples; longer ones are an error.
+    **reading
+        Options of `gyrostab.read.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Log of `gyrostab.schema`.
+    """
+    from gyrostab.read import read_log
+    from gyrostab.regularise import regularise
+
+    raw = read_log(paths, **reading)
+    log = regularise(raw, rate=reading.get("rate"), max_gap=max_gap)
+    for note in raw.attrs.get("notes", []):
+        warnings.warn(note, stacklevel=2)
+    return log
+
+
+def samples_of(log: xr.Dataset) -> int:
+    """Count the samples of a log over all its axes."""
+    return int(log.sizes["axis"] * log.sizes["time"])
+
+
+def run(
+    paths: Sequence[str | Path],
+    output: str | Path,
+    *,
+    reading: Mapping[str, Any] | None = None,
+    windows: Mapping[str, Any] | None = None,
+    fitting: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+    stage: Stage = no_stage,
+) -> Path:
+    """Make the product of some logs and write it as NetCDF, without holding the log in memory.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Logs.
+    output : path
+        NetCDF file to be written.
+    reading, windows, fitting : mapping
+        Options of `gyrostab.read.read_log`, `gyrostab.davar.davar` and `gyrostab.fit.fit_noise`.
+    overwrite : bool
+        Whether an existing output may be replaced.
+    stage : callable
+        Told the name of each stage as it begins, and its number of samples.
+
+    Returns
+    -------
+    Path
+        The file written.
+    """
+    from gyrostab.davar import davar
+    from gyrostab.export import to_netcdf
+    from gyrostab.fit import fit_noise
+
+    target = check_output(output, suffixes=[".nc"], overwrite=overwrite, inputs=paths)
+    stage("reading", 0)
+    log = load_log(paths, **(reading or {}))
+    stage("computing", samples_of(log))
+    surface = davar(log, **(windows or {}))
+    to_netcdf(fit_noise(surface, **(fitting or {})), target, overwrite=overwrite)
+    return target

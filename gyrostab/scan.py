@@ -1,0 +1,123 @@
+"""A table of what is in some logs, before anything is computed from them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from gyrostab.errors import GyrostabError
+
+__all__ = ["COLUMNS", "print_scan", "scan"]
+
+#: Columns of the table; span in s, rate in Hz, missing as a share of the samples between start and end.
+COLUMNS = ("file", "format", "start", "end", "span_s", "rate_hz", "axes", "channels", "rows", "gaps", "missing_share", "odd")
+
+
+def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFrame:
+    r"""Say what is in some logs, one row a file.
+
+    Each file is read once, by itself, and put on a uniform time axis to count what is missing.
+
+    Parameters
+    ----------
+    paths : path or sequence of path
+        Logs in any format that gyrostab reads.
+    **reading
+        Options of `gyrostab.read.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns of `COLUMNS`: file, format, start and end (UTC), span [s], sampling rate [Hz], axes, channels, rows, number of gaps, share
+        of missing samples, and what is odd (for a file that cannot be read, why).
+
+    Raises
+    ------
+    GyrostabError
+        When none of the files can be read: the reason of the first.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "tool.csv"
+    ...     _ = path.write_text("time [s],gyro_x [deg/h]\n" + "".join(f"{n / 10},{n % 3}\n" for n in range(50)))
+    ...     table = scan(path)
+    >>> table.loc[0, ["rate_hz", "axes", "rows"]].to_list()
+    [10.0, 'x', 50]
+    """
+    names = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    rows: list[dict[str, Any]] = []
+    errors: list[GyrostabError] = []
+    for path in names:
+        try:
+            rows.append(_scan_one(path, reading))
+        except GyrostabError as error:
+            errors.append(error)
+            rows.append({"file": str(path), "odd": str(error)})
+    if errors and len(errors) == len(names):
+        raise errors[0]
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
+    from gyrostab.read import ReadOptions, read_log, scan_file
+    from gyrostab.regularise import gap_table, regularise
+    from gyrostab.schema import log_channels, signal_name
+
+    summary = scan_file(path, ReadOptions(**reading))
+    raw = read_log([path], **reading)
+    log = regularise(raw, rate=reading.get("rate"), max_gap="100000D")
+    start, end = (pd.Timestamp(log["time"][place].values) for place in (0, -1))
+    gaps = gap_table(log)
+    signal = log[signal_name(log)]
+    notes = dict.fromkeys([*summary.notes, *log.attrs.get("notes", raw.attrs.get("notes", []))])
+    return {
+        "file": str(path),
+        "format": summary.format,
+        "start": start,
+        "end": end,
+        "span_s": (end - start).total_seconds(),
+        "rate_hz": float(log.attrs["sampling_rate_hz"]),
+        "axes": " ".join(map(str, log["axis"].values)),
+        "channels": " ".join(log_channels(log)),
+        "rows": int(raw.sizes["row"]),
+        "gaps": len(gaps),
+        "missing_share": float(signal.isnull().mean()),
+        "odd": "; ".join(notes),
+    }
+
+
+def print_scan(table: pd.DataFrame) -> None:
+    """Print the table of `scan`: framed on a terminal, plain tab-separated text elsewhere."""
+    if not sys.stdout.isatty():
+        table.to_csv(sys.stdout, sep="\t", index=False)
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    framed = Table("file", "start", "span", "rate [Hz]", "axes", "channels", "rows", "gaps", "missing")
+    for _, row in table.iterrows():
+        if pd.isna(row["rate_hz"]):
+            framed.add_row(row["file"], "[red]cannot be read[/red]")
+            continue
+        cells = (
+            f"{row['file']} ({row['format']})",
+            f"{row['start']:%Y-%m-%d %H:%M:%S}",
+            str(pd.Timedelta(seconds=row["span_s"]).round("ms")),
+            f"{row['rate_hz']:g}",
+            row["axes"],
+            row["channels"],
+            f"{row['rows']:,.0f}",
+            f"{row['gaps']:,.0f}",
+            f"{row['missing_share']:.2%}",
+        )
+        framed.add_row(*cells)
+    console.print(framed)
+    for _, row in table[table["odd"].fillna("") != ""].iterrows():
+        console.print(f"[bold]{row['file']}[/bold]: {row['odd']}", highlight=False)
