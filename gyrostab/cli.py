@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Group, Parameter
 from cyclopts.validators import Number
 
-from gyrostab.errors import GyrostabError, OptionError
+from gyrostab.errors import FormatError, GyrostabError, OptionError
 
 __all__ = ["app", "main"]
 
@@ -213,7 +213,11 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     from gyrostab.scan import print_scan
     from gyrostab.scan import scan as scan_logs
 
-    print_scan(scan_logs(logs, **reading.options()))
+    table = scan_logs(logs, **reading.options())
+    print_scan(table)
+    lost = table[table["format"].isna()]
+    if len(lost):
+        raise FormatError(f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; the table says why")
 
 
 @app.command(sort_key=2, help_epilogue="")
@@ -323,14 +327,14 @@ def fit(
     method
         gls fits variances with their covariance; adev fits deviations, as some papers do, for comparison.
     """
-    from gyrostab.export import open_product, to_netcdf
+    from gyrostab.export import open_surface, to_netcdf
     from gyrostab.fit import fit_noise
     from gyrostab.run import check_output
 
     target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[surface])
     with _work(common) as stage:
         stage("fitting", 0)
-        to_netcdf(fit_noise(open_product(surface), terms=terms, method=method), target, overwrite=common.overwrite)
+        to_netcdf(fit_noise(open_surface(surface), terms=terms, method=method), target, overwrite=common.overwrite)
     print(target)
 
 

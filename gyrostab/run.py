@@ -83,9 +83,10 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
     from gyrostab.read import read_log
     from gyrostab.regularise import regularise
 
-    raw = read_log(paths, **reading)
-    log = regularise(raw, rate=reading.get("rate"), max_gap=max_gap)
-    for note in raw.attrs.get("notes", []):
+    log = read_log(paths, **reading)
+    if "sampling_rate_hz" not in log.attrs:
+        log = regularise(log, rate=reading.get("rate"), max_gap=max_gap)
+    for note in log.attrs.get("notes", []):
         warnings.warn(note, stacklevel=2)
     return log
 

@@ -71,11 +71,12 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
 
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
-    log = regularise(raw, rate=reading.get("rate"), max_gap="100000D")
+    regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
+    log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap="100000D")
     start, end = (pd.Timestamp(log["time"][place].values) for place in (0, -1))
     gaps = gap_table(log)
     signal = log[signal_name(log)]
-    notes = dict.fromkeys([*summary.notes, *log.attrs.get("notes", raw.attrs.get("notes", []))])
+    notes = dict.fromkeys([*summary.notes, *log.attrs.get("notes", [])])
     return {
         "file": str(path),
         "format": summary.format,
@@ -85,7 +86,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         "rate_hz": float(log.attrs["sampling_rate_hz"]),
         "axes": " ".join(map(str, log["axis"].values)),
         "channels": " ".join(log_channels(log)),
-        "rows": int(raw.sizes["row"]),
+        "rows": int(raw.sizes["time" if regular else "row"]),
         "gaps": len(gaps),
         "missing_share": float(signal.isnull().mean()),
         "odd": "; ".join(notes),

@@ -1,0 +1,57 @@
+"""The floors of the house, and what an import may load."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = ("matplotlib", "numba", "pyarrow", "netCDF4", "h5py", "pymatreader", "scipy.stats")
+
+
+def _python(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+
+
+def test_imports_go_down_only():
+    done = _python("import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(config_filename='pyproject.toml'))")
+    assert done.returncode == 0, done.stdout
+    assert "0 broken" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("code", "banned"),
+    [
+        ("import gyrostab", (*HEAVY, "xarray", "pandas", "dask")),
+        ("import gyrostab.cli; gyrostab.cli.main(['--help'])", (*HEAVY, "xarray", "pandas", "dask")),
+        ("import gyrostab.cli; gyrostab.cli.main(['run', '--help'])", (*HEAVY, "xarray", "pandas", "dask")),
+    ],
+)
+def test_import_loads_nothing_heavy(code, banned):
+    done = _python(f"import sys; {code}; print([name for name in {banned!r} if name in sys.modules])")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_public_names_are_functions_whatever_was_imported_first():
+    code = (
+        "import gyrostab, types\n"
+        "from gyrostab.scan import COLUMNS\n"
+        "import gyrostab.regularise, gyrostab.davar\n"
+        "bad = [n for n in gyrostab.__all__ if n != '__version__' and not isinstance(getattr(gyrostab, n), types.FunctionType)]\n"
+        "print(bad)"
+    )
+    done = _python(code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
+
+
+def test_unknown_name_is_an_attribute_error():
+    import gyrostab
+
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        gyrostab.nonsense  # noqa: B018
+    assert "davar" in dir(gyrostab)
