@@ -73,7 +73,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     raw = read_log([path], **reading)
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
     log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap="100000D")
-    start, end = (pd.Timestamp(log["time"][place].values) for place in (0, -1))
+    start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
     gaps = gap_table(log)
     signal = log[signal_name(log)]
     notes = dict.fromkeys([*summary.notes, *log.attrs.get("notes", [])])
