@@ -1,0 +1,203 @@
+"""Several files to one raw log: order, union of axes and channels, channels from other files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
+from gyrostab.read.buffers import park
+from gyrostab.schema import SIGNAL_UNITS
+
+__all__ = ["attach_channels", "concatenate", "memory", "to_disk"]
+
+
+def memory(part: xr.Dataset) -> int:
+    """Bytes of the columns of a raw log that are held in memory."""
+    return sum(variable.nbytes for variable in part.variables.values() if isinstance(variable._data, np.ndarray))
+
+
+def to_disk(part: xr.Dataset) -> xr.Dataset:
+    """The same raw log with its columns in unlinked temporary files."""
+    return part.assign({name: (part[name].dims, park(part[name].values), part[name].attrs) for name in part.variables if name != "axis"})
+
+
+def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Join the raw logs of several files along ``row``, in the order of their first stamps.
+
+    Raises
+    ------
+    TimeError
+        When some files have stamps and others have none.
+    UnitError
+        When files hold different kinds of signal, or a channel changes its unit.
+    FormatError
+        When there is one row only.
+    """
+    if len(parts) == 1:
+        joined = parts[0]
+    else:
+        ordered = _in_order(parts)
+        joined = _join(ordered, _signal(ordered))
+    if joined.sizes["row"] < 2:
+        name = joined.attrs["source_files"][0]
+        raise FormatError(f"{name}: there is one row of data only; a log needs two at least")
+    return joined
+
+
+def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+    timed = ["time" in part.variables for part in parts]
+    if not any(timed):
+        return list(parts)
+    if not all(timed):
+        with_time, without = (
+            next(p.attrs["source_files"][0] for p, t in zip(parts, timed, strict=True) if t is want) for want in (True, False)
+        )
+        raise TimeError(f"{with_time} has time stamps and {without} has none; read them one by one, or give the latter a time column")
+    return sorted(parts, key=_first_stamp)
+
+
+def _first_stamp(part: xr.Dataset) -> int:
+    for start in range(0, part.sizes["row"], 2**16):
+        stamps = part["time"][start : start + 2**16].values
+        good = stamps[~np.isnat(stamps)]
+        if len(good):
+            return int(good[0].astype("datetime64[ns]").view(np.int64))
+    return int(np.iinfo(np.int64).max)
+
+
+def _signal(parts: Sequence[xr.Dataset]) -> str | None:
+    first = parts[0]
+    for part in parts[1:]:
+        if part.attrs.get("kind") != first.attrs.get("kind"):
+            (a, b), (kind_a, kind_b) = zip(*((p.attrs["source_files"][0], p.attrs.get("kind")) for p in (first, part)), strict=True)
+            raise UnitError(f"{a} holds a gyro signal of kind {kind_a!r}, {b} of kind {kind_b!r}; read them one by one")
+    return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
+
+
+def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
+    sizes = [part.sizes["row"] for part in parts]
+    names = [part.attrs["source_files"][0] for part in parts]
+    absent: dict[str, list[str]] = {}
+    data: dict[str, Any] = {}
+    coords: dict[str, Any] = {}
+    if "time" in parts[0].variables:
+        coords["time"] = ("row", _end_to_end([part["time"].data for part in parts]))
+    if signal is not None:
+        axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
+        rows = []
+        for axis in axes:
+            rows.append(_end_to_end([_axis(part, signal, axis) for part in parts]))
+            absent[f"axis {axis}"] = [name for name, part in zip(names, parts, strict=True) if axis not in part["axis"].values]
+        stack = np.stack(rows) if isinstance(rows[0], np.ndarray) else _dask().stack(rows)
+        data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]})
+        coords["axis"] = np.array(axes, dtype=str)
+    for channel in dict.fromkeys(str(name) for part in parts for name in part.data_vars if name != signal):
+        units = _channel_units(parts, channel)
+        columns = [part[channel].data if channel in part else np.full(size, np.nan) for part, size in zip(parts, sizes, strict=True)]
+        data[channel] = ("row", _end_to_end(columns), {"units": units})
+        absent[f"channel {channel}"] = [name for name, part in zip(names, parts, strict=True) if channel not in part]
+    joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
+    gaps = [f"{what} is not in {_some(files)} and is missing there" for what, files in absent.items() if files]
+    joined.attrs.update(
+        source_files=names,
+        row_start=[int(start) for start in np.cumsum([0, *sizes[:-1]])],
+        notes=[*_notes(parts), *gaps],
+        unreadable_rows=sum(part.attrs["unreadable_rows"] for part in parts),
+        unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
+    )
+    return joined
+
+
+def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
+    if axis in part["axis"].values:
+        return part[signal].sel(axis=axis).data
+    return np.full(part.sizes["row"], np.nan)
+
+
+def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
+    holders = [part for part in parts if channel in part]
+    units = {str(part[channel].attrs["units"]): part.attrs["source_files"][0] for part in reversed(holders)}
+    if len(units) > 1:
+        listed = ", ".join(f"{unit!r} in {name}" for unit, name in units.items())
+        raise UnitError(
+            f"channel {channel!r} has different units: {listed}; give one with --unit {channel}=UNIT or drop it with --map {channel}=-"
+        )
+    return next(iter(units))
+
+
+def _end_to_end(columns: list[Any]) -> Any:
+    if all(isinstance(column, np.ndarray) for column in columns):
+        return np.concatenate(columns)
+    return _dask().concatenate([_dask().asarray(column) for column in columns])
+
+
+def _dask() -> Any:
+    import dask.array
+
+    return dask.array
+
+
+def _notes(parts: list[xr.Dataset]) -> list[str]:
+    """The notes of all files; what several files say alike is said once."""
+    said: dict[str, list[str]] = {}
+    for part in parts:
+        name = part.attrs["source_files"][0]
+        for note in part.attrs["notes"]:
+            said.setdefault(note.removeprefix(f"{name}: "), []).append(name)
+    return [f"{_some(names)}: {note}" for note, names in said.items()]
+
+
+def _some(names: list[str], most: int = 3) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Add the channels of other files, each on its own ``time_<channel>`` with values only where present.
+
+    Raises
+    ------
+    OptionError
+        When a channel is in the log already, or a file holds no channel or no stamps.
+    """
+    pieces: dict[str, list[tuple[NDArray[Any], NDArray[Any], str]]] = {}
+    files: list[str] = []
+    for source in sources:
+        name = source.attrs["source_files"][0]
+        files.append(name)
+        for channel, stamps, values, units in _channels(source, name):
+            if channel in log.variables:
+                fix = f"rename it with --map {channel}={channel}_2 or drop it with --map {channel}=-"
+                raise OptionError(f"channel {channel!r} of {name} is in the log too; {fix}")
+            pieces.setdefault(channel, []).append((stamps, values, units))
+    for channel, found in pieces.items():
+        if len({units for _, _, units in found}) > 1:
+            raise UnitError(f"channel {channel!r} has different units in {_some(files)}; give one with --unit {channel}=UNIT")
+        stamps, values = (np.concatenate([piece[place] for piece in found]) for place in (0, 1))
+        order = np.argsort(stamps, kind="stable")
+        dim = f"time_{channel}"
+        log = log.assign_coords({dim: (dim, stamps[order])}).assign({channel: (dim, values[order], {"units": found[0][2]})})
+    if files:
+        notes = [note for source in sources for note in source.attrs.get("notes", [])]
+        log = log.assign_attrs(notes=[*log.attrs.get("notes", []), *notes], channel_files=files)
+    return log
+
+
+def _channels(source: xr.Dataset, name: str) -> list[tuple[str, NDArray[Any], NDArray[Any], str]]:
+    found = []
+    for channel, variable in source.data_vars.items():
+        dim = f"time_{channel}" if f"time_{channel}" in source.variables else "time"
+        if len(variable.dims) != 1 or channel in SIGNAL_UNITS or str(variable.dims[0]) not in ("row", "time", dim):
+            continue
+        if dim not in source.variables:
+            raise OptionError(f"--channel {name}: it has no time column, so its rows cannot be placed; add one, or --map NAME=time")
+        stamps, values = np.asarray(source[dim].values), np.asarray(variable.values)
+        filled = np.isfinite(values) & ~np.isnat(stamps)
+        found.append((str(channel), stamps[filled], values[filled], str(variable.attrs.get("units", "1"))))
+    if not found:
+        raise OptionError(f"--channel {name}: it holds no channel with a unit; give one with --unit NAME=UNIT")
+    return found

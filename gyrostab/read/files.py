@@ -1,0 +1,212 @@
+"""From paths to one raw log: find the reader, read, put the files in order, add the channels of other files."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import xarray as xr
+
+from gyrostab.errors import FormatError, OptionError
+from gyrostab.read.buffers import SPILL_BYTES
+from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
+from gyrostab.read.options import FileSummary, ReadOptions
+
+__all__ = ["Reader", "read_log", "readers", "scan_file"]
+
+GROUP = "gyrostab.readers"
+
+
+class Reader(Protocol):
+    """What a reader module has."""
+
+    def matches(self, path: Path) -> bool:
+        """Whether the file is of this format."""
+
+    def scan(self, path: Path, options: ReadOptions) -> FileSummary:
+        """Look without reading the data."""
+
+    def read(self, path: Path, options: ReadOptions) -> xr.Dataset:
+        """Read into a raw log, or open a regular log."""
+
+
+@cache
+def _registered() -> dict[str, Any]:
+    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+
+
+def readers() -> tuple[str, ...]:
+    """Names of the formats that can be read.
+
+    Examples
+    --------
+    >>> "text" in readers()
+    True
+    """
+    return tuple(_registered())
+
+
+def _reader(path: Path) -> Reader:
+    """The reader of a file; text is tried last, as it is the least particular."""
+    if not path.exists():
+        raise FormatError(f"{path}: there is no such file")
+    for name in sorted(_registered(), key=lambda name: (name == "text", name)):
+        reader = cast(Reader, _registered()[name].load())
+        if reader.matches(path):
+            return reader
+    kind = "directory" if path.is_dir() else f"file with the suffix {path.suffix!r}"
+    raise FormatError(f"{path}: no reader takes this {kind}; formats are {', '.join(readers())}")
+
+
+def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
+    """The files that paths and patterns stand for, each once.
+
+    Raises
+    ------
+    FormatError
+        When a pattern fits no file.
+    """
+    found: list[Path] = []
+    for item in [paths] if isinstance(paths, str | Path) else paths:
+        text = str(item)
+        if Path(text).exists() or not glob.has_magic(text):
+            matching = [Path(text)]
+        else:
+            matching = [Path(match) for match in sorted(glob.glob(text, recursive=True))]
+            if not matching:
+                raise FormatError(f"{text}: no file fits this pattern")
+        found += [path for path in matching if path not in found]
+    if not found:
+        raise OptionError("no file was given; name at least one log")
+    return found
+
+
+def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSummary:
+    r"""Look at a file without reading its data.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    options : ReadOptions, optional
+        Reading options; what they leave unclear stands in the notes.
+
+    Returns
+    -------
+    FileSummary
+        Format, columns, axes, channels, and what is cheap to know of the stamps and the number of rows.
+
+    Raises
+    ------
+    FormatError
+        When no reader takes the file, or it cannot be read at all.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = Path(mkdtemp()) / "log.csv"
+    >>> _ = path.write_text("time [s],gyro_x [deg/h]\n0.0,1.5\n0.5,1.25\n")
+    >>> summary = scan_file(path)
+    >>> summary.axes, summary.n_rows, summary.last
+    (('x',), 2, np.datetime64('1970-01-01T00:00:00.500000000'))
+    """
+    path = Path(path)
+    return _reader(path).scan(path, options or ReadOptions())
+
+
+def read_log(
+    paths: str | Path | Iterable[str | Path],
+    *,
+    rate: float | None = None,
+    start: str | None = None,
+    epoch: str | None = None,
+    map: Mapping[str, str] | None = None,
+    unit: Mapping[str, str] | None = None,
+    kind: str | None = None,
+    channel: str | Path | Sequence[str | Path] = (),
+) -> xr.Dataset:
+    r"""Read one log or many as they were written.
+
+    Parameters
+    ----------
+    paths : path, pattern, or several of them
+        Files are put in the order of their first stamps and joined; an axis or channel that one of them lacks is NaN there.
+    rate : float, optional
+        Sampling rate [Hz] of files without a time column.
+    start : str, optional
+        Stamp of the first row (ISO 8601, UTC) of files without a time column.
+    epoch : str, optional
+        Zero of a numeric time column (ISO 8601, UTC); 1970-01-01 when not given.
+    map : mapping of str to str, optional
+        Header name -> contract name, ``{"wx": "gyro_x [deg/s]"}``; ``"-"`` drops a column.
+    unit : mapping of str to str, optional
+        Name -> unit, ``{"gyro": "deg/s", "time": "us"}``.
+    kind : {"rate", "angle"}, optional
+        How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` increments.
+    channel : path or sequence of path, optional
+        Files with further channels; each keeps its stamps as ``time_<channel>``.
+
+    Returns
+    -------
+    xarray.Dataset
+        The raw log: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree], ``time(row)`` where the file has
+        stamps (NaT where unreadable), channels, and the attributes ``kind``, ``source_files``, ``row_start``, ``notes``,
+        ``unreadable_rows``, ``unreadable_cells``. A regular log that gyrostab wrote is returned as that log, lazily.
+
+    Raises
+    ------
+    FormatError, UnitError, OptionError, TimeError
+        With the file, the place, what is wrong and what to do.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = Path(mkdtemp()) / "log.csv"
+    >>> _ = path.write_text("time [s],gyro_x [deg/s],temperature [degC]\n0.0,0.5,21\n0.5,****,\n1.0,0.25,\n")
+    >>> raw = read_log(path)
+    >>> raw.rate.sel(axis="x").values
+    array([1800.,   nan,  900.])
+    >>> raw.attrs["notes"][-1]
+    'log.csv: 1 of 3 rows are unreadable: line 3'
+    """
+    options = ReadOptions(
+        rate=rate, start=start, epoch=epoch, map=dict(map or {}), unit=dict(unit or {}), kind=kind, channel=cast(Any, channel)
+    )
+    found = expand(paths)
+    extra = expand(options.channel) if options.channel else []
+    parts = _read_all(found, options)
+    logs = [path.name for path, part in zip(found, parts, strict=True) if "sampling_rate_hz" in part.attrs]
+    if logs and len(parts) > 1:
+        raise OptionError(f"{logs[0]} is a regular log already; join the source files instead, or process the logs one by one")
+    channels = [_reader(path).read(path, replace(options, channels_only=True, start=None)) for path in extra]
+    if not logs:
+        _check_options([*parts, *channels])
+        parts = [concatenate(parts)]
+    return attach_channels(parts[0], channels)
+
+
+def _read_all(paths: Sequence[Path], options: ReadOptions) -> list[xr.Dataset]:
+    """Read the files one by one; what does not fit into memory together waits on disk."""
+    parts: list[xr.Dataset] = []
+    held = 0
+    for path in paths:
+        part = _reader(path).read(path, options)
+        held += memory(part)
+        if held > SPILL_BYTES and len(paths) > 1:
+            held -= memory(part)
+            part = to_disk(part)
+        parts.append(part)
+    return parts
+
+
+def _check_options(parts: Sequence[xr.Dataset]) -> None:
+    """Refuse a ``--map`` or ``--unit`` that no file has a use for: it is a slip of the pen."""
+    unmatched = set.intersection(*(set(part.attrs.pop("unmatched_options", ())) for part in parts))
+    if unmatched:
+        files = ", ".join(dict.fromkeys(name for part in parts for name in part.attrs["source_files"]))
+        raise OptionError(f"{' and '.join(sorted(unmatched))}: no such column in {files}; gyrostab scan lists the columns")

@@ -1,0 +1,132 @@
+"""MATLAB files, version 5 and 7.3: vectors by name, columns of a matrix by ``name/3`` (counted from 0).
+
+The rows of a matrix run along its longer side. Fields of a structure are called ``name.field``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import FormatError
+from gyrostab.read.arrays import float32_note, read_columns, summarise
+from gyrostab.read.buffers import SPILL_BYTES
+from gyrostab.read.columns import Plan, plan_columns
+from gyrostab.read.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+#: A matrix with more columns than this is no table of sensors.
+MAX_COLUMNS = 64
+
+
+@dataclass(frozen=True)
+class _Vector:
+    """One column of the file: array, position across the long side (None for a vector), orientation."""
+
+    header: str
+    array: Any  # numpy array or h5py dataset
+    place: int | None
+    along: int
+
+    @property
+    def rows(self) -> int:
+        return int(max(self.array.shape))
+
+    def part(self, start: int, stop: int) -> Any:
+        if self.array.ndim == 1:
+            return self.array[start:stop]
+        place = self.place or 0
+        return self.array[start:stop, place] if self.along == 0 else self.array[place, start:stop]
+
+
+def matches(path: Path) -> bool:
+    """Whether the file is called ``.mat``."""
+    return path.is_file() and path.suffix.lower() == ".mat"
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Variables and their shapes, the stamps of the two ends."""
+    vectors, plan, notes = _look(path, options)
+    rows = vectors[0].rows if vectors else 0
+    return summarise(path, "matlab", plan, options, rows, lambda source, start, stop: vectors[source].part(start, stop), notes)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a MATLAB file; see `gyrostab.read.read_log`."""
+    vectors, plan, notes = _look(path, options)
+    notes += float32_note(plan, [vector.array.dtype for vector in vectors])
+    rows = vectors[0].rows if vectors else 0
+    return read_columns(plan, options, rows, lambda source, a, b: vectors[source].part(a, b), notes=notes, limit=limit)
+
+
+def _look(path: Path, options: ReadOptions) -> tuple[list[_Vector], Plan, list[str]]:
+    found = [vector for name, array in _arrays(path) for vector in _vectors(name, array)]
+    if not found:
+        raise FormatError(
+            f"{path.name}: there is no vector or matrix of numbers in it (tables and objects are not read; save plain arrays)"
+        )
+    rows = max(vector.rows for vector in found)
+    kept = [vector for vector in found if vector.rows == rows]
+    others = [vector.header for vector in found if vector.rows != rows]
+    notes = [f"left out, as they are shorter than the {rows} rows of the longest: {', '.join(others[:20])}"] if others else []
+    return kept, plan_columns(path, [vector.header for vector in kept], options), notes
+
+
+def _vectors(name: str, array: Any) -> Iterator[_Vector]:
+    shape = array.shape
+    if len(shape) == 2 and min(shape) > 1:
+        along = int(np.argmax(shape))
+        if min(shape) <= MAX_COLUMNS:
+            yield from (_Vector(f"{name}/{place}", array, place, along) for place in range(min(shape)))
+    elif len(shape) in (1, 2) and max(shape, default=0) > 1:
+        yield _Vector(name, array, None, int(np.argmax(shape)))
+
+
+def _arrays(path: Path) -> Iterator[tuple[str, Any]]:
+    with path.open("rb") as file:
+        head = file.read(1024)
+    if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head:
+        yield from _arrays_hdf(path)
+        return
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, simplify_cells=False, struct_as_record=True, chars_as_strings=True)
+    except Exception as error:  # scipy raises bare errors of many kinds on damaged files
+        raise FormatError(f"{path.name}: this MATLAB file cannot be read ({error}); it may be cut off, copy it again") from error
+    for name, value in content.items():
+        if not name.startswith("__"):
+            yield from _flatten(name, value)
+
+
+def _flatten(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
+        for field in value.dtype.names:
+            yield from _flatten(f"{name}.{field}", value.reshape(-1)[0][field])
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        yield name, value
+
+
+def _arrays_hdf(path: Path) -> Iterator[tuple[str, Any]]:
+    import h5py
+
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise FormatError(f"{path.name}: this MATLAB 7.3 file cannot be opened ({error}); it may be cut off, copy it again") from error
+    found: list[tuple[str, Any]] = []
+
+    def visit(name: str, item: Any) -> None:
+        text = item.attrs.get("MATLAB_class", b"double")
+        kind = text.decode() if isinstance(text, bytes) else str(text)
+        if isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and kind != "char" and not name.startswith("#"):
+            found.append((name.replace("/", "."), item))
+
+    file.visititems(visit)
+    yield from found

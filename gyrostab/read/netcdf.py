@@ -1,0 +1,178 @@
+"""NetCDF and Zarr: regular logs that gyrostab wrote (opened lazily), and foreign files of variables along one dimension.
+
+In a foreign file the columns of a two-dimensional variable are called ``name/label``, with the label from the coordinate of the
+short dimension, or ``name/0`` without one; ``gyro/x`` and ``rate/x`` are gyro axes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import FormatError, SchemaError
+from gyrostab.read.arrays import float32_note, read_columns, summarise
+from gyrostab.read.buffers import SPILL_BYTES
+from gyrostab.read.columns import Plan, plan_columns
+from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
+from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
+from gyrostab.timegrid import grid_times, time_coordinate
+from gyrostab.units import ON_DISK
+
+__all__ = ["matches", "read", "scan"]
+
+MAX_COLUMNS = 64
+CHECKED_BLOCKS = 33
+
+
+@dataclass(frozen=True)
+class _Column:
+    header: str
+    variable: Any
+    place: int | None
+    along: int
+
+    def part(self, start: int, stop: int) -> Any:
+        if self.place is None:
+            return self.variable[start:stop]
+        return self.variable[start:stop, self.place] if self.along == 0 else self.variable[self.place, start:stop]
+
+
+def matches(path: Path) -> bool:
+    """Whether the path is a NetCDF file by name or magic, or a Zarr store."""
+    if path.is_dir():
+        return any((path / name).exists() for name in ("zarr.json", ".zgroup", ".zmetadata"))
+    with path.open("rb") as file:
+        return file.read(3) == b"CDF" or path.suffix.lower() in (".nc", ".nc4", ".cdf", ".netcdf")
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Variables and sizes, the stamps of the two ends."""
+    log = _open_log(path)
+    if log is not None:
+        return _summarise_log(path, log)
+    columns, rows, plan, notes = _look(path, options)
+    return summarise(path, "netcdf", plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The regular log, lazily, or the raw log of a foreign file; see `gyrostab.read.read_log`."""
+    log = _open_log(path)
+    if log is not None:
+        return log
+    columns, rows, plan, notes = _look(path, options)
+    notes += float32_note(plan, [column.variable.dtype for column in columns])
+    return read_columns(plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes=notes, limit=limit)
+
+
+def _open_log(path: Path) -> xr.Dataset | None:
+    """The file as a regular log of gyrostab, or None when it is something else."""
+    engine: Any = "zarr" if path.is_dir() else "netcdf4"
+    try:
+        bare = xr.open_dataset(path, engine=engine, decode_cf=False, chunks=None)
+    except Exception as error:  # the backends raise errors of many kinds on damaged files
+        raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
+    dims, regular = set(bare.dims), "sampling_rate_hz" in bare.attrs
+    has_signal = any(name in bare.variables for name in SIGNAL_UNITS)
+    bare.close()
+    if not (regular and has_signal and {"axis", "time"} <= dims):
+        if path.is_dir():
+            raise FormatError(f"{path.name}: this Zarr store is no gyrostab log (axis and time, attribute sampling_rate_hz)")
+        return None
+    log = xr.open_dataset(path, engine=engine, chunks={})
+    try:
+        for name in log.variables:
+            units = log[name].attrs.get("units")
+            if units in ON_DISK.values():
+                log[name].attrs["units"] = next(inner for inner, disk in ON_DISK.items() if disk == units)
+        log = log.assign_coords(axis=np.array([str(axis) for axis in log["axis"].values], dtype=str))
+        check_log(log)
+    except SchemaError as error:
+        raise SchemaError(f"{path.name}: {error}") from error
+    log.attrs.setdefault("source_files", [path.name])
+    for name in ("source_files", "notes"):
+        if isinstance(log.attrs.get(name), str):
+            log.attrs[name] = [line for line in log.attrs[name].split("\n") if line]
+    return _rebuild_time(path, log)
+
+
+def _rebuild_time(path: Path, log: xr.Dataset) -> xr.Dataset:
+    """Put the computed time axis in place of the stored stamps, where they agree; otherwise refuse the log."""
+    rate, size = float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
+    stored = log["time"].variable
+
+    def stamps(start: int, stop: int) -> Any:
+        return np.asarray(stored[start:stop].values).astype("datetime64[ns]").view(np.int64)
+
+    begin = int(stamps(0, 1)[0])
+    for first in np.unique(np.linspace(0, max(size - 1024, 0), CHECKED_BLOCKS).astype(int)):
+        found = stamps(int(first), min(int(first) + 1024, size))
+        expected = grid_times(begin, rate, np.arange(first, first + len(found)))
+        if np.any(np.abs(found - expected) > 1000):
+            at = int(first) + int(np.argmax(np.abs(found - expected) > 1000))
+            when = np.datetime64(int(stamps(at, at + 1)[0]), "ns")
+            return log.assign_attrs(notes=[*log.attrs.get("notes", []), f"{path.name}: stamp {at} ({when}) is off the grid of {rate:g} Hz"])
+    return log.drop_vars("time").assign_coords(time_coordinate(begin, rate, size))
+
+
+def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
+    channels = log_channels(log)
+    signal = signal_name(log)
+    axes = [ColumnSummary(str(axis), f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal]) for axis in log["axis"].values]
+    others = [ColumnSummary(name, name, "channel", None, str(log[name].attrs.get("units", ""))) for name in channels]
+    return FileSummary(
+        path=path,
+        format="gyrostab log",
+        columns=(*axes, *others),
+        axes=tuple(str(axis) for axis in log["axis"].values),
+        channels=tuple(channels),
+        first=np.datetime64(log["time"][0].values, "ns"),
+        last=np.datetime64(log["time"][-1].values, "ns"),
+        n_rows=log.sizes["time"],
+        notes=tuple(log.attrs.get("notes", ())),
+    )
+
+
+def _look(path: Path, options: ReadOptions) -> tuple[list[_Column], int, Plan, list[str]]:
+    import netCDF4
+
+    file = netCDF4.Dataset(path)
+    numeric = [v for v in file.variables.values() if getattr(v.dtype, "kind", "O") in "iuf" and v.ndim in (1, 2)]
+    lines = Counter(v.dimensions[0] for v in numeric if v.ndim == 1)
+    lines.update(max(v.dimensions, key=lambda d: len(file.dimensions[d])) for v in numeric if v.ndim == 2)
+    if not lines:
+        raise FormatError(f"{path.name}: there is no variable of numbers along a dimension; groups are not looked into")
+    dim = max(lines, key=lambda d: (len(file.dimensions[d]), lines[d]))
+    columns: list[_Column] = []
+    notes: list[str] = []
+    left: list[str] = []
+    for variable in numeric:
+        found = _columns(file, variable, dim)
+        columns += found
+        left += [] if found else [variable.name]
+    if left:
+        notes.append(f"left out, as they do not run along {dim!r} alone: {', '.join(left[:20])}")
+    units = {index: str(column.variable.units) for index, column in enumerate(columns) if "units" in column.variable.ncattrs()}
+    plan = plan_columns(path, [column.header for column in columns], options, units=units)
+    return columns, len(file.dimensions[dim]), plan, notes
+
+
+def _columns(file: Any, variable: Any, dim: str) -> list[_Column]:
+    if variable.dimensions == (dim,):
+        return [_Column(variable.name, variable, None, 0)]
+    if dim not in variable.dimensions or variable.ndim != 2:
+        return []
+    along = variable.dimensions.index(dim)
+    other = variable.dimensions[1 - along]
+    size = len(file.dimensions[other])
+    if size > MAX_COLUMNS:
+        return []
+    labels = [str(place) for place in range(size)]
+    if other in file.variables:
+        labels = [str(label) for label in np.ma.getdata(file.variables[other][:])]
+    stem = "gyro_" if variable.name.lower() in ("gyro", "rate") else f"{variable.name}/"
+    return [_Column(f"{stem}{label}", variable, place, along) for place, label in enumerate(labels)]

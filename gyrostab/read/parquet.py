@@ -1,0 +1,84 @@
+"""Parquet logs: one column per channel, units in square brackets or in the field's metadata."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import FormatError
+from gyrostab.read.arrays import BATCH_ROWS, float32_note, holds_dates, summarise, take_batch
+from gyrostab.read.buffers import SPILL_BYTES
+from gyrostab.read.columns import Plan, plan_columns
+from gyrostab.read.intake import Intake
+from gyrostab.read.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+
+def matches(path: Path) -> bool:
+    """Whether the file begins as Parquet files do, or is called like one."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(4) == b"PAR1" or path.suffix.lower() in (".parquet", ".pq")
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Schema and row count from the footer, the stamps of the two ends."""
+    file, plan = _look(path, options)
+
+    def fetch(source: int, start: int, stop: int) -> Any:
+        group = 0 if start == 0 else file.num_row_groups - 1
+        values = _plain(file.read_row_group(group, columns=[file.schema_arrow.names[source]]).column(0))
+        return values[: stop - start] if start == 0 else values[start - stop :]
+
+    return summarise(path, "parquet", plan, options, file.metadata.num_rows, fetch)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a Parquet file; see `gyrostab.read.read_log`."""
+    file, plan = _look(path, options)
+    names = file.schema_arrow.names
+    intake = Intake(plan.check(), options, limit=limit)
+    wanted = [names[column.source] for column in plan.columns]
+    for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=wanted):
+        found = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
+        take_batch(intake, options, {column.source: _plain(found[names[column.source]]) for column in plan.columns})
+    return intake.finish(float32_note(plan, file.schema_arrow.types))
+
+
+def _look(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        file = parquet.ParquetFile(path)
+        schema = file.schema_arrow
+        head = next(file.iter_batches(batch_size=50), None)
+    except (pa.ArrowException, OSError) as error:
+        raise FormatError(f"{path.name}: this Parquet file cannot be opened ({error}); it may be cut off, copy it again") from error
+    units = {}
+    for index, entry in enumerate(schema):
+        text = (entry.metadata or {}).get(b"units")
+        if text is not None:
+            units[index] = text.decode()
+    dates = [index for index in range(len(schema)) if head is not None and holds_dates(_plain(head.column(index)))]
+    return file, plan_columns(path, schema.names, options, units=units, stamped=dates)
+
+
+def _plain(column: Any) -> Any:
+    """An arrow column as numpy; nulls are masked where the type has no NaN."""
+    import pyarrow as pa
+
+    column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    kind = column.type
+    if pa.types.is_timestamp(kind):
+        return column.cast(pa.timestamp("ns", tz=kind.tz), safe=False).cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False)
+    if pa.types.is_integer(kind) and column.null_count:
+        return np.ma.array(column.fill_null(0).to_numpy(zero_copy_only=False), mask=column.is_null().to_numpy(zero_copy_only=False))
+    if pa.types.is_decimal(kind):
+        return np.array([None if value is None else str(value) for value in column.to_pylist()], dtype=object)
+    return column.to_numpy(zero_copy_only=False)

@@ -1,0 +1,212 @@
+"""Text logs: comma, semicolon, tab or blank separated, plain or gzipped, in one pass of bounded memory.
+
+Blocks of the file go to pyarrow with fixed column types. A block that does not parse is cut into small pieces, and only the
+pieces that hold the trouble are read cell by cell.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError
+from gyrostab.read.buffers import SPILL_BYTES
+from gyrostab.read.cells import Typing, parse_cells, parse_fast, stamp_types
+from gyrostab.read.columns import Column, Plan, plan_columns
+from gyrostab.read.intake import Intake, summary_notes, summary_stamp
+from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, split_line
+from gyrostab.read.options import FileSummary, ReadOptions
+from gyrostab.read.stamps import NAT, cells_to_ns, looks_iso
+
+__all__ = ["matches", "read", "scan"]
+
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
+HEAD_BYTES = 2**18
+BLOCK_BYTES = 2**24
+PIECE_BYTES = 2**18
+COUNTED_BYTES = 2**24
+
+
+def matches(path: Path) -> bool:
+    """Whether the file has the name of a text log (gzipped or not)."""
+    name = path.name.lower().removesuffix(".gz")
+    return path.is_file() and name.endswith(SUFFIXES)
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Header, columns, first and (of plain files) last stamp, from the two ends of the file."""
+    layout, plan = _look(path, options)
+    time = next(iter(plan.of("time")), None)
+    first = last = n_rows = None
+    if time is not None:
+        stamps = _stamps(layout, time, layout.samples, options)
+        first = next((int(stamp) for stamp in stamps if stamp != NAT), None)
+    if not _gzipped(path):
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            file.seek(max(layout.offset, size - 2**14))
+            tail = [split_line(line, layout.separator) for line in file.read().decode("latin-1").splitlines()]
+            if time is not None:
+                gyro = [column.source for column in plan.of("gyro")]
+                solid = [row for row in tail if len(row) == layout.width and (not gyro or any(_is_value(row[at], layout) for at in gyro))]
+                ends = _stamps(layout, time, solid, options)
+                last = next((int(stamp) for stamp in ends[::-1] if stamp != NAT), None)
+            if size <= COUNTED_BYTES:
+                file.seek(layout.offset)
+                n_rows = sum(1 for line in file if line.strip() and not line.lstrip().startswith((b"#", b"%")))
+    return FileSummary(
+        path=path,
+        format="text",
+        columns=plan.summaries,
+        axes=tuple(column.name for column in plan.of("gyro")),
+        channels=tuple(column.name for column in plan.of("channel")),
+        first=summary_stamp(first),
+        last=summary_stamp(last),
+        n_rows=n_rows,
+        notes=summary_notes(plan, layout.notes),
+    )
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a text file; see `gyrostab.read.read_log`."""
+    layout, plan = _look(path, options)
+    intake = Intake(plan.check(), options, limit=limit)
+    typing = Typing(layout, plan, options, stamp_types(layout, plan))
+    line = layout.line
+    for block in _blocks(path, layout.offset):
+        line = _take(block, line, typing, intake)
+    return intake.finish(layout.notes)
+
+
+def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
+    with _open(path) as file:
+        head = _chunk(path, file, HEAD_BYTES, 0)
+        layout = find_layout(path, head, complete=len(head) < HEAD_BYTES)
+    stamped = [
+        column for column in range(layout.width) if any(looks_iso(row[column]) for row in layout.samples if len(row) == layout.width)
+    ]
+    return layout, plan_columns(path, layout.headers, options, stamped=stamped)
+
+
+def _stamps(layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions) -> NDArray[np.int64]:
+    cells = [row[time.source] for row in rows if len(row) == layout.width]
+    if layout.decimal_comma:
+        cells = [cell.replace(",", ".") for cell in cells]
+    return cells_to_ns(cells, time.time_unit, options.epoch_ns)
+
+
+def _is_value(cell: str, layout: Layout) -> bool:
+    return is_number(cell, comma=layout.decimal_comma)
+
+
+def _gzipped(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
+
+
+def _open(path: Path) -> IO[bytes]:
+    return cast(IO[bytes], gzip.open(path, "rb")) if _gzipped(path) else path.open("rb")
+
+
+def _chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
+    """Up to `size` bytes, short only at the end of the file."""
+    parts: list[bytes] = []
+    missing = size
+    try:
+        while missing > 0 and (part := file.read(missing)):
+            parts.append(part)
+            missing -= len(part)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        read = done + size - missing
+        what = f"the gzip stream is damaged or cut off; {read:,} bytes of text could be read before that ({error})"
+        rescue = f"copy the file again, or save the readable part with: gzip -dc {path.name} > rescued.csv"
+        raise FormatError(f"{path.name}: {what}. {rescue}") from error
+    return b"".join(parts)
+
+
+def _blocks(path: Path, offset: int) -> Iterator[bytes]:
+    """The data rows in blocks that end at the end of a line."""
+    with _open(path) as file:
+        done = len(_chunk(path, file, offset, 0))
+        rest = b""
+        while chunk := _chunk(path, file, BLOCK_BYTES, done):
+            done += len(chunk)
+            cut = chunk.rfind(b"\n") + 1
+            if cut == 0:
+                rest += chunk
+                if len(rest) > 4 * BLOCK_BYTES:
+                    raise FormatError(f"{path.name}: a line is longer than {len(rest):,} bytes; this is no text log with line ends")
+                continue
+            yield rest + chunk[:cut]
+            rest = chunk[cut:]
+        if rest.strip():
+            yield rest + b"\n"
+
+
+def _take(block: bytes, line: int, typing: Typing, intake: Intake) -> int:
+    """Read one block into the intake; the number of the line after it."""
+    lines = block.count(b"\n")
+    tidy = _tidy(block, typing.layout.separator)
+    if not _take_fast(tidy, lines, line, typing, intake):
+        first = line
+        start = 0
+        while start < len(tidy):
+            stop = tidy.find(b"\n", start + PIECE_BYTES) + 1 or len(tidy)
+            piece = tidy[start:stop]
+            count = piece.count(b"\n")
+            if not _take_fast(piece, count, first, typing, intake):
+                values, stamps, words, numbers = parse_cells(piece, first, typing)
+                intake.add(values, stamps, words=words, locate=partial(_line_names, numbers))
+            first += count
+            start = stop
+    return line + lines
+
+
+def _take_fast(piece: bytes, lines: int, first: int, typing: Typing, intake: Intake) -> bool:
+    parsed = parse_fast(piece, typing)
+    if parsed is None:
+        return False
+    values, stamps = parsed
+    rows = len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
+
+    if rows != lines and b'"' in piece and rows != sum(1 for text in piece.split(b"\n") if text.strip()):
+        return False  # a stray quote has swallowed line ends
+
+    def locate(wanted: Sequence[int]) -> list[str]:
+        if rows == lines:
+            return [f"line {first + row}" for row in wanted]
+        filled = [number for number, text in enumerate(piece.split(b"\n"), first) if text.strip()]
+        return [f"line {filled[row]}" for row in wanted]
+
+    intake.add(values, stamps, locate=locate)
+    return True
+
+
+def _line_names(numbers: Sequence[int], rows: Sequence[int]) -> list[str]:
+    return [f"line {numbers[row]}" for row in rows]
+
+
+def _tidy(block: bytes, separator: str) -> bytes:
+    """Empty the comment lines (so that lines keep their numbers) and, where blanks separate, make each run of them one."""
+    if b"#" in block or b"%" in block:
+        block = re.sub(rb"(?m)^[ \t]*[#%][^\n]*", b"", block)
+    if separator != BLANK:
+        return block
+    data: NDArray[Any] = np.frombuffer(block.replace(b"\t", b" ").replace(b"\r", b""), dtype=np.uint8)
+    blank, end = data == 32, data == 10
+    drop = np.zeros(len(data), dtype=bool)
+    drop[1:] = blank[1:] & (blank[:-1] | end[:-1])
+    drop[:1] = blank[:1]
+    kept = data[~drop]
+    trailing = np.zeros(len(kept), dtype=bool)
+    trailing[:-1] = (kept[:-1] == 32) & (kept[1:] == 10)
+    return kept[~trailing].tobytes()
