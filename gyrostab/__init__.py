@@ -19,9 +19,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gyrostab.davar import davar as davar
+    from gyrostab.export import open_log as open_log
     from gyrostab.export import open_product as open_product
+    from gyrostab.export import open_surface as open_surface
     from gyrostab.export import to_netcdf as to_netcdf
+    from gyrostab.export import to_zarr as to_zarr
     from gyrostab.fit import fit_noise as fit_noise
+    from gyrostab.log import make_log as make_log
     from gyrostab.plot import plot_coefficients as plot_coefficients
     from gyrostab.plot import plot_davar as plot_davar
     from gyrostab.plot import plot_davar_3d as plot_davar_3d
@@ -37,7 +41,10 @@ _HOME = {
     "davar": "davar",
     "fit_noise": "fit",
     "gap_table": "regularise",
+    "make_log": "log",
+    "open_log": "export",
     "open_product": "export",
+    "open_surface": "export",
     "plot_coefficients": "plot",
     "plot_davar": "plot",
     "plot_davar_3d": "plot",
@@ -46,6 +53,7 @@ _HOME = {
     "regularise": "regularise",
     "scan": "scan",
     "to_netcdf": "export",
+    "to_zarr": "export",
     "write_report": "report",
 }
 
@@ -54,7 +62,10 @@ __all__ = [
     "davar",
     "fit_noise",
     "gap_table",
+    "make_log",
+    "open_log",
     "open_product",
+    "open_surface",
     "plot_coefficients",
     "plot_davar",
     "plot_davar_3d",
@@ -63,6 +74,7 @@ __all__ = [
     "regularise",
     "scan",
     "to_netcdf",
+    "to_zarr",
     "write_report",
 ]
 

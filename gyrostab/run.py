@@ -13,7 +13,7 @@ import xarray as xr
 from gyrostab.errors import OptionError, OutputError
 from gyrostab.progress import Stage, no_stage
 
-__all__ = ["check_output", "load_log", "run", "samples_of"]
+__all__ = ["check_output", "check_windows", "load_log", "run", "samples_of"]
 
 
 def check_output(path: str | Path, *, suffixes: Sequence[str] = (), overwrite: bool = False, inputs: Iterable[str | Path] = ()) -> Path:
@@ -91,6 +91,38 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
     return log
 
 
+def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau_max: str | None = None, **other: Any) -> None:
+    """Make sure, before the long work starts, that the lengths of time can be read at all.
+
+    Parameters
+    ----------
+    window, step, taus, tau_max : str
+        Options of `gyrostab.davar.davar`, as text; others are passed over.
+
+    Raises
+    ------
+    OptionError
+        When one of them is no length of time, or the step is longer than the window.
+
+    Examples
+    --------
+    >>> check_windows(window="10", step="1min")
+    Traceback (most recent call last):
+    gyrostab.errors.OptionError: window '10' has no unit; write for instance 10s, 10min or 10samples
+    """
+    from gyrostab.windows import duration_seconds, samples
+
+    fine = 1e6  # Hz; the true rate is not known yet
+    length, hop = samples(window, fine, "window"), samples(step, fine, "step") if step else 1
+    if step and ("sample" in window) == ("sample" in step) and hop > length:
+        raise OptionError(f"the step of {step} is longer than the window of {window}, so samples would be left out; give a shorter --step")
+    if taus.strip() not in ("octave", "all") and not taus.strip().isdigit():
+        for part in taus.split(","):
+            duration_seconds(part, "tau")
+    if tau_max:
+        duration_seconds(tau_max, "tau_max")
+
+
 def samples_of(log: xr.Dataset) -> int:
     """Count the samples of a log over all its axes."""
     return int(log.sizes["axis"] * log.sizes["time"])
@@ -131,6 +163,7 @@ def run(
     from gyrostab.fit import fit_noise
 
     target = check_output(output, suffixes=[".nc"], overwrite=overwrite, inputs=paths)
+    check_windows(**(windows or {}))
     stage("reading", 0)
     log = load_log(paths, **(reading or {}))
     stage("computing", samples_of(log))
