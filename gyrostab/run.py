@@ -169,4 +169,19 @@ def run(
     stage("computing", samples_of(log))
     surface = davar(log, **(windows or {}))
     to_netcdf(fit_noise(surface, **(fitting or {})), target, overwrite=overwrite)
+    _note_constant(target)
     return target
+
+
+def _note_constant(path: Path) -> None:
+    """Warn of windows in which an axis never moved: the Allan variance is zero at the shortest and the longest tau."""
+    from gyrostab.export import open_product
+
+    with open_product(path) as product:
+        still = (product["avar"].isel(tau=[0, -1]) == 0.0).all("tau").compute()
+    for axis in still["axis"].values:
+        share = float(still.sel(axis=axis).mean())
+        if share > 0.0:
+            warnings.warn(
+                f"gyro axis {axis} is constant in {share:.0%} of the windows: is the sensor stuck, or its column a filler?", stacklevel=2
+            )
