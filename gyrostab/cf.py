@@ -1,0 +1,248 @@
+"""How a dataset looks on disk by the CF conventions, and back: order of dimensions, exact times, unit strings, attributes.
+
+References
+----------
+CF conventions 1.11, sections 2.5.1 (missing data), 3.1 (units), 4.4 (time), 6.1 (labels), 7.1 (bounds); ACDD 1.3.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import SchemaError
+from gyrostab.schema import check_log, check_product, check_surface
+from gyrostab.timegrid import TimeGridIndex, grid_times, period_ns, time_coordinate
+from gyrostab.units import ON_DISK, on_disk
+
+__all__ = ["from_disk", "to_disk"]
+
+CONVENTIONS = "CF-1.11, ACDD-1.3"
+TITLES = {
+    "product": "Dynamic Allan variance of a gyro log, with the noise coefficients Q, N, B, K and R of every window",
+    "surface": "Dynamic Allan variance of a gyro log",
+    "log": "Gyro log on a uniform time axis",
+    "dataset": "Gyro stability data",
+}
+#: Dimensions in the order of the file; those not named keep their place between `tau` and `time`.
+_ORDER = ("axis", "term", "tau")
+_CHUNK = 2**17  # values in one compressed chunk: 1 MiB of float64
+_EPOCH = "1970-01-01T00:00:00"
+_CALENDAR = {"calendar": "proleptic_gregorian", "units_metadata": "leap_seconds: none"}
+_PACKING = ("dtype", "scale_factor", "add_offset")  # of integer counts, where the reader declares them
+_JSON_NAMES = "json_attributes"
+
+# Names that UDUNITS reads as we mean them. A whole power may follow; a broken one is misread without a word, so it never passes.
+_NAMES = "degree_Celsius|degree|hour|microradian|radian|s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
+_SAFE_UNIT = re.compile(rf"(?:{_NAMES})(?:-?[1-9])?(?: (?:{_NAMES})(?:-?[1-9])?)*")
+
+
+def _kind(dataset: xr.Dataset) -> str:
+    for kind, check in (("product", check_product), ("surface", check_surface), ("log", check_log)):
+        with contextlib.suppress(SchemaError):
+            check(dataset)
+            return kind
+    return "dataset"
+
+
+def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
+    """Lay a dataset out as the file shall hold it; `verb` goes to its history."""
+    kind = _kind(dataset)
+    divisor = 1000 if _whole_microseconds(dataset) else 1
+    bounds = [str(variable.attrs["bounds"]) for variable in dataset.variables.values() if "bounds" in variable.attrs]
+    variables: dict[Any, xr.Variable] = {}
+    for name, variable in dataset.variables.items():
+        stored = _lazy(variable).transpose(*_disk_order(variable.dims)) if name not in dataset.dims else variable
+        attrs = _attributes_to_disk({"long_name": str(name).replace("_", " "), **variable.attrs})
+        data = stored.data if name not in dataset.dims else None
+        if variable.dtype.kind == "M":
+            data, grid = _stamps(dataset, name, stored, divisor)
+            attrs = {**attrs, **grid}
+            if name in dataset.dims:
+                attrs = {"standard_name": "time", "axis": "T", **attrs}
+            if name not in bounds:
+                attrs |= {"units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}", **_CALENDAR}
+        elif data is None:
+            data = variable.values
+        packing = (
+            {key: variable.encoding[key] for key in _PACKING if key in variable.encoding} if "scale_factor" in variable.encoding else {}
+        )
+        variables[name] = xr.Variable(stored.dims, data, {} if name in bounds else attrs, packing)
+    coords = {name: variables.pop(name) for name in list(dataset.coords) if name not in bounds}
+    stored_set = xr.Dataset(variables, coords=xr.Coordinates(coords, indexes={}))
+    if "avar" in variables:
+        beside = [name for name in ("count", "coverage", "edf", "estimator") if name in variables]
+        stored_set["avar"].attrs["ancillary_variables"] = " ".join(beside)
+    stored_set.attrs = _global_attributes(dataset, kind, verb)
+    return stored_set
+
+
+def _disk_order(dims: tuple[Any, ...]) -> list[Any]:
+    last = [dim for dim in ("time", "bnds") if dim in dims]
+    return [dim for dim in _ORDER if dim in dims] + [dim for dim in dims if dim not in (*_ORDER, *last)] + last
+
+
+def _lazy(variable: xr.Variable) -> xr.Variable:
+    """Turn a variable that still sits in another file into a dask array, so that it is copied chunk by chunk."""
+    return variable if variable._in_memory or variable.chunks is not None else variable.chunk("auto")
+
+
+def _whole_microseconds(dataset: xr.Dataset) -> bool:
+    """Whether microseconds hold every time exactly; nanoseconds always do, but fewer programs read them."""
+    for name, variable in dataset.variables.items():
+        index = dataset.xindexes.get(name)
+        if isinstance(index, TimeGridIndex):
+            whole, fraction = period_ns(index.transform.rate)
+            if fraction or whole % 1000 or index.transform.start % 1000:
+                return False
+        elif variable.dtype.kind == "M" and np.any(_nanoseconds(variable.values) % 1000):
+            return False
+    return True
+
+
+def _nanoseconds(stamps: Any) -> np.ndarray[Any, np.dtype[np.int64]]:
+    return np.asarray(stamps).astype("datetime64[ns]").view(np.int64)
+
+
+def _stamps(dataset: xr.Dataset, name: Any, variable: xr.Variable, divisor: int) -> tuple[Any, dict[str, Any]]:
+    """Whole microseconds or nanoseconds since 1970; for a computed time axis, the rule that makes it too."""
+    import dask.array as da
+
+    index = dataset.xindexes.get(name)
+    if not isinstance(index, TimeGridIndex):
+        stamps = variable.values
+        if np.isnat(stamps).any():
+            raise SchemaError(f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); every time must be known")
+        return _nanoseconds(stamps) // divisor, {}
+    grid = index.transform
+    rule = {"start_ns": grid.start, "rate_hz": grid.rate, "first": grid.first, "stride": grid.stride}
+
+    def count(position: Any) -> Any:
+        return grid_times(grid.start, grid.rate, grid.first + grid.stride * position) // divisor
+
+    positions = da.arange(grid.size, chunks=_CHUNK, dtype=np.int64)
+    return positions.map_blocks(count, dtype=np.int64), {"sampling_grid": json.dumps(rule)}
+
+
+def _attributes_to_disk(attrs: dict[str, Any]) -> dict[str, Any]:
+    """Attributes of types that NetCDF holds, with `units` that UDUNITS reads rightly (any other unit goes to `source_units`)."""
+    if "units" in attrs:
+        units = on_disk(str(attrs["units"]))
+        if units in ("1", *ON_DISK.values()) or _SAFE_UNIT.fullmatch(units):
+            attrs["units"] = units
+        else:
+            attrs["source_units"] = attrs.pop("units")
+    coded = []
+    for name, value in attrs.items():
+        if isinstance(value, np.generic):
+            attrs[name] = value = value.item()
+        if isinstance(value, str) or (isinstance(value, int | float) and not isinstance(value, bool)):
+            continue
+        if not isinstance(value, np.ndarray):
+            attrs[name] = json.dumps(value, default=str, ensure_ascii=False)
+            coded.append(name)
+    if coded:
+        attrs[_JSON_NAMES] = " ".join(coded)
+    return attrs
+
+
+def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, Any]:
+    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    try:
+        version = metadata.version("gyrostab")
+    except metadata.PackageNotFoundError:
+        version = "unknown"
+    given = dict(dataset.attrs)
+    files = given.get("source_files", ())
+    history = given.get("history", "")
+    lines = [history] if isinstance(history, str) else [str(line) for line in history]
+    given["history"] = "\n".join([*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"])
+    given.setdefault("title", TITLES[kind])
+    names = [files] if isinstance(files, str) else [str(name) for name in files]
+    given.setdefault("source", "gyro log: " + ", ".join(names) if names else "gyro log")
+    given |= {"Conventions": CONVENTIONS, "date_created": now, "gyrostab_version": version, "gyrostab_content": kind}
+    given.setdefault("references", "IEEE Std 952; Wang et al., Sensors 16 (2016) 2081 (dynamic Allan variance of gyros with missing data)")
+    times = dataset.get("time")
+    if times is not None and times.dtype.kind == "M" and times.size:
+        for end, position in (("start", 0), ("end", -1)):
+            given[f"time_coverage_{end}"] = f"{times[position].values.astype('datetime64[us]')}Z"
+    return _attributes_to_disk(given)
+
+
+def from_disk(stored: xr.Dataset) -> xr.Dataset:
+    """Turn what was opened without decoding times and without indexes into the dataset it was in memory."""
+    bounds = {variable.attrs["bounds"]: name for name, variable in stored.variables.items() if "bounds" in variable.attrs}
+    variables: dict[Any, xr.Variable] = {}
+    grids: dict[str, xr.Coordinates] = {}
+    for name, variable in stored.variables.items():
+        grid = _sampling_grid(str(name), variable)
+        if grid is not None:
+            grids[str(name)] = grid
+            continue
+        parent = stored.variables[bounds[name]] if name in bounds else variable
+        opened = _decode_time(variable, parent.attrs)
+        if opened.dtype.kind in "OT":
+            opened = opened.astype(str)
+        if name in stored.coords or name in bounds:
+            opened = opened.load()
+        opened.attrs = _attributes_from_disk(dict(opened.attrs))
+        variables[name] = opened.transpose(*_memory_order(opened.dims))
+    names = [name for name in variables if name in stored.coords or name in bounds]
+    dataset = xr.Dataset(variables).set_coords(names)
+    for name, grid in grids.items():
+        attrs = _attributes_from_disk(dict(stored.variables[name].attrs))
+        attrs.pop("sampling_grid")
+        dataset = dataset.assign_coords(grid)
+        dataset[name].attrs = attrs
+    dataset.attrs = _attributes_from_disk(dict(stored.attrs))
+    dataset.set_close(stored.close)
+    return dataset
+
+
+def _memory_order(dims: tuple[Any, ...]) -> list[Any]:
+    return [*(dim for dim in dims if dim not in ("tau", "term", "bnds")), *(dim for dim in ("tau", "term", "bnds") if dim in dims)]
+
+
+def _decode_time(variable: xr.Variable, attrs: dict[Any, Any]) -> xr.Variable:
+    if " since " not in str(attrs.get("units", "")):
+        return variable
+    timed = variable.copy(deep=False)
+    timed.attrs = {**variable.attrs, "units": attrs["units"], "calendar": attrs.get("calendar", "standard")}
+    decoded: xr.Variable = xr.conventions.decode_cf_variable("time", timed).load()
+    return decoded.astype("datetime64[ns]")
+
+
+def _sampling_grid(name: str, variable: xr.Variable) -> xr.Coordinates | None:
+    """Rebuild the computed time axis that a file declares, if its size and its first and last stamps agree with the declaration."""
+    if "sampling_grid" not in variable.attrs or not variable.size:
+        return None
+    rule = json.loads(variable.attrs["sampling_grid"])
+    first, stride, size = rule["first"], rule["stride"], variable.size
+    whole = xr.Dataset(coords=time_coordinate(rule["start_ns"], rule["rate_hz"], first + stride * (size - 1) + 1, name=name))
+    axis = whole.isel({name: slice(first, None, stride)})
+    ends = _decode_time(variable[[0, -1]], dict(variable.attrs)).values
+    return axis.coords if np.array_equal(axis[name][[0, -1]].values, ends) else None
+
+
+def _attributes_from_disk(attrs: dict[str, Any]) -> dict[str, Any]:
+    for name in str(attrs.pop(_JSON_NAMES, "")).split():
+        attrs[name] = json.loads(attrs[name])
+    for name, value in attrs.items():
+        attrs[name] = value.item() if isinstance(value, np.generic) else value
+    if "since" in str(attrs.get("units", "")):
+        del attrs["units"]
+    for name in ("calendar", "units_metadata", "ancillary_variables"):
+        attrs.pop(name, None)
+    if "source_units" in attrs:
+        attrs["units"] = attrs.pop("source_units")
+    inner = {stored: units for units, stored in ON_DISK.items()}
+    if "units" in attrs:
+        attrs["units"] = inner.get(attrs["units"], attrs["units"])
+    return attrs

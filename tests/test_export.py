@@ -1,0 +1,419 @@
+"""Export: what is written is legal, exact and complete, and comes back as it was."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import tracemalloc
+from pathlib import Path
+
+import cf_units
+import dask.array as da
+import hypothesis.extra.numpy as hnp
+import netCDF4
+import numpy as np
+import pytest
+import synthetic
+import xarray as xr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gyrostab.errors import FormatError, OutputError, SchemaError
+from gyrostab.export import open_dataset, open_log, open_product, open_surface, to_netcdf, to_zarr
+from gyrostab.noise import LAWS, TERMS, model_avar
+from gyrostab.output import new_output
+from gyrostab.schema import VARIABLES, attributes
+from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
+from gyrostab.units import INNER
+
+KINDS = {"product": synthetic.product, "surface": synthetic.surface, "log": synthetic.log}
+OPEN = {"product": open_product, "surface": open_surface, "log": open_log}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("files")
+    return {kind: to_netcdf(make(), folder / f"{kind}.nc") for kind, make in KINDS.items()}
+
+
+def assert_same(before: xr.Dataset, after: xr.Dataset) -> None:
+    assert set(before.variables) == set(after.variables)
+    assert set(before.coords) == set(after.coords)
+    for name, variable in before.variables.items():
+        assert after[name].dims == variable.dims, name
+        assert after[name].dtype == variable.dtype, name
+        np.testing.assert_array_equal(after[name].values, variable.values, err_msg=str(name))
+        for key, value in variable.attrs.items():
+            np.testing.assert_array_equal(after[name].attrs[key], value)
+    for key, value in before.attrs.items():
+        if key != "history":
+            assert after.attrs[key] == value
+            assert type(after.attrs[key]) is type(value)
+    assert after.attrs["history"].startswith(before.attrs.get("history", ""))
+
+
+@pytest.mark.parametrize("write", [to_netcdf, to_zarr])
+@pytest.mark.parametrize("kind", KINDS)
+def test_comes_back_as_it_was(tmp_path, kind, write):
+    before = KINDS[kind]()
+    with OPEN[kind](write(before, tmp_path / "it")) as after:
+        assert_same(before, after)
+        again = write(after, tmp_path / "again")
+        with OPEN[kind](again) as twice:
+            assert_same(before, twice)
+            assert len(twice.attrs["history"].splitlines()) == len(before.attrs["history"].splitlines()) + 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cf_checker_has_no_remark(files, kind):
+    checker = Path(sys.executable).with_name("compliance-checker")
+    offline = {**os.environ, "http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+    done = subprocess.run(
+        [checker, "-t", "cf:1.11", "-c", "strict", files[kind]], capture_output=True, text=True, check=False, timeout=120, env=offline
+    )
+    assert "All tests passed!" in done.stdout, done.stdout
+    assert "WARNING" not in done.stderr, done.stderr
+    assert done.returncode == 0
+
+
+def test_layout_seen_by_plain_netcdf4(files):
+    with netCDF4.Dataset(files["product"]) as file:
+        assert not file.groups
+        assert file["avar"].dimensions == ("axis", "tau", "time")
+        assert file["observable"].dimensions == ("axis", "term", "time")
+        assert file.Conventions == "CF-1.11, ACDD-1.3"
+        for name, variable in file.variables.items():
+            data = variable.dtype.kind == "f" and name not in ("time", "tau", "time_bounds")
+            assert ("_FillValue" in variable.ncattrs()) is data, name
+            if data:
+                assert np.isfinite(variable._FillValue)
+                assert variable.filters()["zlib"]
+                assert variable.filters()["shuffle"]
+            assert not any(isinstance(variable.getncattr(key), bool | type(None)) for key in variable.ncattrs())
+        assert file["time"].dtype == np.int64
+        assert file["time"].units_metadata == "leap_seconds: none"
+        assert file["estimator"].flag_meanings == "none strict_runs weighted_clusters"
+        assert list(file["axis"][:]) == ["x", "y", "z"]
+        assert file["avar"][:].mask.any()
+        assert json.loads(file.notes) == synthetic.product().attrs["notes"]
+        before = synthetic.product().avar.transpose("axis", "tau", "time").values
+        np.testing.assert_array_equal(file["avar"][:].filled(np.nan), before)
+
+
+def test_plain_xarray_selects_an_axis(files):
+    with xr.open_dataset(files["product"]) as plain:
+        np.testing.assert_array_equal(plain.avar.sel(axis="y").transpose("time", "tau"), synthetic.product().avar.sel(axis="y"))
+        np.testing.assert_array_equal(plain.time, synthetic.product().time)
+
+
+def test_ncdump_reads_it(files):
+    ncdump = shutil.which("ncdump")
+    if ncdump is None:
+        pytest.skip("ncdump (netcdf-bin) is not installed")
+    text = subprocess.run([ncdump, "-h", files["product"]], capture_output=True, text=True, check=True).stdout
+    assert "double avar(axis, tau, time) ;" in text
+    assert 'N:unit_label = "deg/sqrt(h)" ;' in text
+
+
+@pytest.mark.parametrize(
+    ("name", "to", "number"),
+    [
+        ("avar", "radian2 s-2", (np.pi / 180 / 3600) ** 2),
+        ("window_mean", "radian s-1", np.pi / 180 / 3600),
+        ("Q", "radian", 1e-6),
+        ("N", "radian s-1", np.pi / 180 / 3600),
+        ("B", "radian s-1", np.pi / 180 / 3600),
+        ("K", "radian s-1", np.pi / 180 / 3600),
+        ("R", "radian s-2", np.pi / 180 / 3600**2),
+        ("N_squared", "radian2 s-1", (np.pi / 180) ** 2 / 3600),
+        ("K_squared", "radian2 s-3", (np.pi / 180) ** 2 / 3600**3),
+        ("tau", "s", 1.0),
+        ("vibration", "m s-2", 9.80665),
+        ("temperature", "K", 274.15),
+        ("temperature_rate", "K s-1", 1 / 3600),
+    ],
+)
+def test_udunits_reads_the_number(files, name, to, number):
+    with netCDF4.Dataset(files["product"]) as file:
+        for variable in [name, f"{name}_stderr", f"{name}_upper"]:
+            if variable in file.variables:
+                assert cf_units.Unit(file[variable].units).convert(1.0, to) == pytest.approx(number, rel=1e-12)
+
+
+def test_every_unit_written_is_read_rightly(files):
+    powers = {"degree2 hour-2": (np.pi / 180 / 3600) ** 2}
+    for path in files.values():
+        with netCDF4.Dataset(path) as file:
+            for variable in file.variables.values():
+                units = getattr(variable, "units", "1")
+                if " since " not in units:
+                    assert cf_units.Unit(units).is_convertible(cf_units.Unit(units))
+                    assert "." not in units.replace("9.80665", "")
+    assert cf_units.Unit("degree2 hour-2").convert(1.0, "radian2 s-2") == pytest.approx(powers["degree2 hour-2"])
+    for units in {INNER[q] for q in INNER} - {"g"} | {a["units"] for a in VARIABLES.values() if "units" in a}:
+        frame = xr.Dataset({"it": ("time", np.ones(2), {"units": units})})
+        with tempfile.TemporaryDirectory() as folder, netCDF4.Dataset(to_netcdf(frame, Path(folder) / "u.nc")) as file:
+            assert file["it"].units == units  # none of ours is banished to source_units
+
+
+@pytest.mark.parametrize(("symbol", "hours"), [("N", 1.0), ("K", 3.0)])
+def test_stored_coefficient_is_the_allan_deviation_at_its_reading_point(files, symbol, hours):
+    with netCDF4.Dataset(files["product"]) as file:
+        assert file[symbol].tau_ref == f"{hours:g} h"
+        stored = file[symbol][:].compressed()
+        assert stored.size > 50
+        deviation = [np.sqrt(model_avar(hours * 3600.0, {symbol: value})) for value in stored]
+        np.testing.assert_allclose(stored, deviation, rtol=1e-12)
+        np.testing.assert_allclose(file[f"{symbol}_squared"][:].compressed(), stored**2)
+        assert file[symbol].unit_label == LAWS[symbol].label
+    assert np.sqrt(model_avar(hours * 3600.0, dict.fromkeys(TERMS, 0.0) | {symbol: 2.5})) == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize(
+    "units", ["deg/h", "degree hour-0.5", "degree hour^-0.5", "dph", "gal/min", "degree/sqrt(hour)", "0.1 arcsec/s", "K-1.5"]
+)
+def test_a_unit_that_udunits_refuses_or_misreads_is_not_written_as_units(tmp_path, units):
+    frame = xr.Dataset({"it": ("time", np.ones(2), {"units": units})})
+    path = to_netcdf(frame, tmp_path / "u.nc")
+    with netCDF4.Dataset(path) as file:
+        assert "units" not in file["it"].ncattrs()
+        assert file["it"].source_units == units
+    assert open_dataset(path)["it"].attrs["units"] == units
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    values=hnp.arrays(
+        np.float64, hnp.array_shapes(min_dims=3, max_dims=3, max_side=4), elements=st.floats(allow_nan=True, allow_infinity=True)
+    ),
+    units=st.sampled_from([*INNER.values(), "degree2 hour-2", "rpm", "m s-2"]),
+    stamps=st.lists(st.integers(-(2**62), 2**62), min_size=4, max_size=4, unique=True),
+    notes=st.lists(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8), max_size=3),
+    write=st.sampled_from([to_netcdf, to_zarr]),
+)
+def test_round_trip_of_anything(tmp_path, values, units, stamps, notes, write):
+    times = np.sort(np.array(stamps[: values.shape[1]], dtype=np.int64)).view("datetime64[ns]")
+    before = xr.Dataset(
+        {"avar": (("axis", "time", "tau"), values, {"units": units}), "single": ("time", np.arange(values.shape[1], dtype=np.float32))},
+        coords={"time": times, "axis": [f"a{i}" for i in range(values.shape[0])]},
+        attrs={"notes": notes, "arguments": {"window": 600.0, "gaps": None, "on": True}, "samples": 5},
+    )
+    assert_same(before, open_dataset(write(before, tmp_path / write.__name__, overwrite=True)))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    start=st.integers(-(2**60), 2**60),
+    rate=st.sampled_from([300.0, 400.0, 99.3, 1.0, 1000 / 3, 0.1]),
+    part=st.tuples(st.integers(0, 20), st.integers(30, 60), st.integers(1, 7)),
+)
+def test_computed_time_axis_comes_back_to_the_nanosecond(tmp_path, start, rate, part):
+    whole = xr.Dataset({"rate": (("axis", "time"), np.zeros((1, 60)), {"units": "degree hour-1"})}, coords={"axis": ["x"]})
+    before = whole.assign_coords(time_coordinate(start, rate, 60)).assign_attrs(sampling_rate_hz=rate).isel(time=slice(*part))
+    after = open_log(to_netcdf(before, tmp_path / "grid.nc", overwrite=True))
+    assert isinstance(after.xindexes["time"], TimeGridIndex)
+    np.testing.assert_array_equal(after.time.values.view(np.int64), grid_times(start, rate, np.arange(60)[slice(*part)]))
+    np.testing.assert_array_equal(after.time, before.time)
+
+
+def test_a_cut_file_does_not_believe_its_old_time_axis(tmp_path):
+    path = to_netcdf(synthetic.log(), tmp_path / "log.nc")
+    with xr.open_dataset(path, decode_times=False) as plain:
+        plain.isel(time=slice(100, 200)).to_netcdf(tmp_path / "cut.nc")
+    cut = open_log(tmp_path / "cut.nc")
+    np.testing.assert_array_equal(cut.time, synthetic.log().time[100:200])
+    assert not isinstance(cut.xindexes["time"], TimeGridIndex)
+
+
+def test_whole_microseconds_are_readable_by_num2date(tmp_path):
+    path = to_netcdf(synthetic.log(rate=400.0, start=1_790_000_000_000_000_000), tmp_path / "log.nc")
+    with netCDF4.Dataset(path) as file:
+        assert file["time"].units.startswith("microseconds since")
+        second = netCDF4.num2date(file["time"][1], file["time"].units, file["time"].calendar)
+        assert second.strftime("%Y-%m-%dT%H:%M:%S.%f") == "2026-09-21T14:13:20.002500"
+
+
+def test_missing_time_is_refused(tmp_path):
+    log = synthetic.log()
+    log["gap_start"] = ("gap", np.array(["NaT"], "datetime64[ns]"))
+    with pytest.raises(SchemaError, match=r"gap_start.*1 missing"):
+        to_netcdf(log, tmp_path / "log.nc")
+    assert not list(tmp_path.iterdir())
+
+
+def test_integer_counts_are_stored_as_integers(tmp_path):
+    log = synthetic.log()
+    log["rate"] = log.rate.copy(data=np.round(log.rate / 0.1) * 0.1)
+    log["rate"].encoding = {"dtype": np.dtype("i4"), "scale_factor": 0.1}
+    path = to_netcdf(log, tmp_path / "log.nc")
+    with netCDF4.Dataset(path) as file:
+        file.set_auto_maskandscale(False)
+        assert file["rate"].dtype == np.int32
+    np.testing.assert_array_equal(open_log(path).rate, log.rate)
+
+
+def test_a_lazy_log_is_never_held_whole(tmp_path):
+    blocks = []
+
+    def block(block_info=None):
+        shape = block_info[None]["chunk-shape"]
+        blocks.append(shape)
+        return np.full(shape, float(len(blocks)))
+
+    size = 2_000_000
+    rate = da.map_blocks(block, chunks=((1, 1, 1), (200_000,) * 10), dtype=float, meta=np.empty((0, 0)))
+    log = xr.Dataset({"rate": (("axis", "time"), rate, {"units": "degree hour-1"})}, coords={"axis": list("xyz")})
+    log = log.assign_coords(time_coordinate(0, 300.0, size)).assign_attrs(sampling_rate_hz=300.0)
+    import dask
+
+    with dask.config.set(scheduler="synchronous"):
+        tracemalloc.start()
+        path = to_netcdf(log, tmp_path / "log.nc")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert len(blocks) == 30  # each block is computed once
+    assert peak < 3 * size * 8 / 3
+    with netCDF4.Dataset(path) as file:
+        assert file["rate"].chunking()[0] == 1
+    after = open_log(path)
+    assert after.rate.chunks is not None
+    assert int(after.time[-1].values.view(np.int64)) == int(grid_times(0, 300.0, size - 1))
+
+
+@pytest.mark.parametrize("write", [to_netcdf, to_zarr])
+def test_existing_output_is_kept_unless_told_otherwise(tmp_path, write):
+    path = write(synthetic.surface(windows=3), tmp_path / "out")
+    with pytest.raises(OutputError, match="exists already; give --overwrite"):
+        write(synthetic.surface(windows=4), path)
+    assert open_surface(path).sizes["time"] == 3
+    write(synthetic.surface(windows=4), path, overwrite=True)
+    assert open_surface(path).sizes["time"] == 4
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_file_can_be_rewritten_from_itself(tmp_path):
+    path = to_netcdf(synthetic.product(), tmp_path / "p.nc")
+    to_netcdf(open_product(path), path, overwrite=True)
+    assert_same(synthetic.product(), open_product(path))
+
+
+FULL = """
+import resource, sys
+sys.path.insert(0, {tests!r})
+import synthetic
+from gyrostab.errors import OutputError
+from gyrostab.export import to_netcdf
+log = synthetic.log(samples=300_000)
+log = log.chunk(time=50_000) if {lazy} else log
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+try:
+    to_netcdf(log, "out.nc", overwrite=True)
+except OutputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+def test_a_full_disk_leaves_the_old_file_and_one_message(tmp_path, lazy):
+    (tmp_path / "out.nc").write_text("old")
+    code = FULL.format(tests=str(Path(__file__).parent), lazy=lazy)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+    assert done.stderr == ""
+    assert done.stdout.startswith("out.nc: cannot be written: ")
+    assert "disk full" in done.stdout
+    assert [p.name for p in tmp_path.iterdir()] == ["out.nc"]
+    assert (tmp_path / "out.nc").read_text() == "old"
+
+
+def test_unwritable_directory():
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o555)
+    root = os.geteuid() == 0
+    try:
+        if root:
+            os.seteuid(65534)  # root may write anywhere; nobody may not
+        with pytest.raises(OutputError, match="no permission to write in"), new_output(folder / "out.nc"):
+            pass
+    finally:
+        if root:
+            os.seteuid(0)
+        shutil.rmtree(folder)
+
+
+def test_no_such_directory(tmp_path):
+    with pytest.raises(OutputError, match=r"nowhere/out\.nc: .*there is no directory"):
+        to_netcdf(synthetic.surface(windows=2), tmp_path / "nowhere" / "out.nc")
+
+
+def test_a_directory_is_not_replaced_by_a_file(tmp_path):
+    (tmp_path / "out.nc").mkdir()
+    with pytest.raises(OutputError, match="a directory has this name"):
+        to_netcdf(synthetic.surface(windows=2), tmp_path / "out.nc", overwrite=True)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
+def test_an_interruption_leaves_nothing_behind(tmp_path, error):
+    def fail(block):
+        raise error
+
+    surface = synthetic.surface(windows=4).chunk(time=2)
+    surface["avar"] = surface.avar.copy(data=surface.avar.data.map_blocks(fail, dtype=float, meta=np.empty((0, 0, 0))))
+    for write in (to_netcdf, to_zarr):
+        with pytest.raises(error):
+            write(surface, tmp_path / "out")
+        assert not list(tmp_path.iterdir())
+
+
+def test_output_has_the_usual_permissions(tmp_path):
+    umask = os.umask(0o022)
+    try:
+        path = to_netcdf(synthetic.surface(windows=2), tmp_path / "out.nc")
+    finally:
+        os.umask(umask)
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_foreign_and_damaged_files(tmp_path, files):
+    (tmp_path / "words.nc").write_text("time, gyro_x\n")
+    (tmp_path / "half.nc").write_bytes(files["product"].read_bytes()[: files["product"].stat().st_size // 2])
+    (tmp_path / "store.zarr").mkdir()
+    for name in ("words.nc", "half.nc", "store.zarr"):
+        with pytest.raises(FormatError, match=rf"{name}: is not (NetCDF|Zarr), or is damaged or cut short"):
+            open_product(tmp_path / name)
+    xr.Dataset({"sst": ("x", [1.0])}).to_netcdf(tmp_path / "sea.nc")
+    with pytest.raises(FormatError, match="not one that gyrostab wrote"):
+        open_dataset(tmp_path / "sea.nc")
+    with pytest.raises(FormatError, match=r"nothing\.nc: there is no such file"):
+        open_log(tmp_path / "nothing.nc")
+
+
+@pytest.mark.parametrize(("kind", "opener"), [("surface", open_product), ("log", open_surface), ("product", open_log)])
+def test_the_wrong_kind_is_named(files, kind, opener):
+    with pytest.raises(FormatError, match=r"does not hold a .*make one with 'gyrostab"):
+        opener(files[kind])
+
+
+def test_a_product_is_a_surface_too(files):
+    assert "avar" in open_surface(files["product"])
+
+
+def test_provenance(files):
+    with netCDF4.Dataset(files["product"]) as file:
+        assert file.history.splitlines()[0] == "2026-09-21T14:13:20Z read"
+        assert "gyrostab" in file.history.splitlines()[1]
+        assert file.source == "gyro log: bore_run_4a.csv, bore_run_4b.csv"
+        assert json.loads(file.source_files) == ["bore_run_4a.csv", "bore_run_4b.csv"]
+        assert file.title.startswith("Dynamic Allan variance")
+        assert file.window_samples == 1800
+        assert {"date_created", "gyrostab_version", "time_coverage_start", "time_coverage_end"} <= set(file.ncattrs())
+
+
+def test_attributes_of_the_schema_reach_the_file(files):
+    with netCDF4.Dataset(files["product"]) as file:
+        for name in ("avar", "edf", "N", "K_upper", "observable"):
+            for key, value in attributes(name).items():
+                np.testing.assert_array_equal(file[name].getncattr(key), value)
