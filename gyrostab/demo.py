@@ -73,17 +73,15 @@ def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Time
     }
 
 
-def summarise(product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Timestamp]], *, window: str = WINDOW) -> pd.DataFrame:
+def summarise(product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Timestamp]]) -> pd.DataFrame:
     """Tabulate the coefficients of each part, over the windows that lie wholly in it.
 
     Parameters
     ----------
     product : xarray.Dataset
-        Product of `gyrostab.fit_noise`.
+        Product of `gyrostab.fit_noise`, with the length of its windows in the attribute ``window_s``.
     parts : dict
         Name to first and last stamp, as `find_parts` gives them.
-    window : str
-        Length of the product's windows.
 
     Returns
     -------
@@ -93,7 +91,7 @@ def summarise(product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Times
     """
     from gyrostab.noise import LAWS
 
-    half = pd.Timedelta(window) / 2
+    half = pd.Timedelta(seconds=float(product.attrs["window_s"])) / 2
     centre = pd.DatetimeIndex(product["time"].values)
     rows = []
     for axis in product["axis"].values:
@@ -109,10 +107,14 @@ def summarise(product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Times
 def _one_cell(part: xr.Dataset, symbol: str) -> str:
     flags = part["observable"].sel(term=symbol).values
     if flags.size and np.mean(flags == 2) > 0.5:
-        return f"{np.median(part[symbol].values[flags == 2]):.3g}"
+        return _round(np.median(part[symbol].values[flags == 2]), 3)
     upper = part[f"{symbol}_upper"].values
     upper = upper[np.isfinite(upper)]
-    return f"< {np.median(upper):.2g}" if upper.size else "-"
+    return f"< {_round(np.median(upper), 2)}" if upper.size else "-"
+
+
+def _round(value: float, digits: int) -> str:
+    return f"{float(f'{value:.{digits}g}'):g}"
 
 
 def format_summary(summary: pd.DataFrame) -> str:

@@ -315,6 +315,26 @@ def test_interrupt_is_exit_code_3(log, tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_real_interrupt_leaves_nothing_behind(tmp_path):
+    path = write_log(tmp_path / "long.csv")
+    code = (
+        "import os, signal, sys, xarray\n"
+        "from gyrostab.cli import main\n"
+        "write = xarray.Dataset.to_netcdf\n"
+        "def slow(dataset, target, **options):\n"
+        "    written = write(dataset, target, **options)\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return written\n"
+        "xarray.Dataset.to_netcdf = slow\n"
+        f"sys.exit(main(['ingest', {str(path)!r}, '-o', {str(tmp_path / 'log.nc')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 3, done.stderr
+    assert "interrupted" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [entry.name for entry in tmp_path.iterdir()] == ["long.csv"]
+
+
 def test_a_fault_of_ours_is_exit_code_1_without_traceback(log, tmp_path, monkeypatch, capsys):
     def broken(*args: object, **options: object) -> None:
         raise ZeroDivisionError("of all things")
