@@ -1,0 +1,253 @@
+"""From stamps to samples: which row belongs to which sample of a uniform grid.
+
+The rows come in blocks; all that must be remembered between two blocks is in three arrays (`new_state`), so the
+result does not depend on where a block ends. A run is a stretch of rows without a break that fills a stretch of the
+grid without a break: ``(first sample, first row, length)``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = [
+    "DUPLICATE",
+    "FIRST",
+    "LOOK",
+    "NO_STAMP",
+    "OPEN_RUN",
+    "OUT_OF_ORDER",
+    "RESTART",
+    "STARTED",
+    "STEP",
+    "new_state",
+    "place",
+    "track",
+]
+
+#: Value of a stamp that could not be read (numpy's NaT as an integer).
+NO_STAMP = np.iinfo(np.int64).min
+
+#: Rows that `place` may look ahead; hand it that many more than it is to place.
+LOOK = 64
+_ORDER = 16  # rows within which an out-of-order row is followed by one past the latest stamp
+
+# what happened to a row, numbered as in schema.GAP_CAUSES
+DUPLICATE, OUT_OF_ORDER, STEP, RESTART = 2, 3, 5, 6
+
+# places in the state: integers and stamps
+_HEAD, _ROW, _RUN_GRID, _RUN_ROW, _RUN_LENGTH, _PENDING, _PENDING_ROW, _GRID0, _STAMP0, _LATEST, FIRST, STARTED = range(12)
+#: Where the state keeps the run that is still open: first sample, first row, length.
+OPEN_RUN = slice(_RUN_GRID, _RUN_LENGTH + 1)
+_RING = 1 << 14
+
+
+def new_state() -> tuple[np.ndarray, np.ndarray]:
+    """What `place` remembers between two blocks: counters, and which of the last samples are taken."""
+    return np.zeros(12, dtype=np.int64), np.zeros(_RING, dtype=np.bool_)
+
+
+@njit(nogil=True, cache=True)
+def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
+    """Count the samples between stamps that lie near a lattice of `period`.
+
+    The phase follows the stamps with `gain`, so that neither jitter nor a slightly wrong period breaks the count.
+
+    Parameters
+    ----------
+    stamps : ndarray of int64, shape (n,)
+        Stamps [ns], in the order of the rows.
+    period : float
+        Approximate sampling period [ns].
+    gain : float
+        Share of a stamp's deviation that the phase takes over.
+    longest : float
+        A longer step, or one backwards by as much, starts a new piece [ns].
+
+    Returns
+    -------
+    count : ndarray of int64, shape (n,)
+        Sample number within the piece.
+    piece : ndarray of int64, shape (n,)
+        Number of the piece.
+    """
+    n = len(stamps)
+    count = np.zeros(n, dtype=np.int64)
+    piece = np.zeros(n, dtype=np.int64)
+    phase = 0.0  # of the latest sample, behind its stamp [ns]
+    for i in range(1, n):
+        step = float(stamps[i] - stamps[i - 1])
+        piece[i] = piece[i - 1]
+        if abs(step) > longest:
+            piece[i] += 1
+            phase = 0.0
+            continue
+        ahead = (step + phase) / period
+        k = int(np.rint(ahead))
+        count[i] = count[i - 1] + k
+        phase = (1.0 - gain) * (step + phase - k * period)
+    return count, piece
+
+
+@njit(nogil=True, cache=True)
+def _fits(stamps, j, n, expected, origin, grid0, period, wanted):  # type: ignore[no-untyped-def]
+    """Whether the next readable stamps after row j lie where unbroken counting puts them, after `expected`."""
+    found = 0
+    last = min(n, j + 1 + LOOK)
+    for m in range(j + 1, last):
+        if stamps[m] == NO_STAMP:
+            continue
+        position = grid0 + (stamps[m] - origin) / period
+        if abs(position - (expected + (m - j))) > 0.5:
+            return False
+        found += 1
+        if found == wanted:
+            return True
+    return False
+
+
+@njit(nogil=True, cache=True)
+def _persists(stamps, j, n, latest):  # type: ignore[no-untyped-def]
+    """Whether the stamps after row j stay behind the latest one, so that the clock was set back."""
+    found = 0
+    for m in range(j + 1, min(n, j + 1 + LOOK)):
+        if stamps[m] == NO_STAMP:
+            continue
+        if stamps[m] > latest:
+            return False
+        found += 1
+        if found == _ORDER:
+            break
+    return found > 1
+
+
+@njit(nogil=True, cache=True)
+def _origin(stamps, j, period):  # type: ignore[no-untyped-def]
+    """Stamp [ns] that sample j should have had, as the stamps after it tell: its own jitter must not shift all others."""
+    total, found = 0.0, 0
+    for m in range(j, min(len(stamps), j + 32)):
+        if stamps[m] == NO_STAMP:
+            continue
+        position = (stamps[m] - stamps[j]) / period
+        if abs(position) < 500:
+            total += position - np.rint(position)
+            found += 1
+    return stamps[j] + np.int64(np.rint(total / found * period))
+
+
+@njit(nogil=True, cache=True)
+def _occupy(ring, head, sample):  # type: ignore[no-untyped-def]
+    """Mark `sample`, past the head, as taken and all between as free."""
+    for g in range(max(head + 1, sample - len(ring) + 1), sample):
+        ring[g % len(ring)] = False
+    ring[sample % len(ring)] = True
+
+
+@njit(nogil=True, cache=True)
+def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
+    """Give rows their samples.
+
+    The next row takes the next sample while its stamp is within `hold` of it; otherwise the sample is found anew from
+    the stamp, counted from the start of the piece, so nothing accumulates.
+
+    Parameters
+    ----------
+    rows, stamps : ndarray of int64
+        Row numbers, rising, and stamps [ns] or `NO_STAMP`; up to `LOOK` more than `n`.
+    n : int
+        Rows to place; the rest is only looked at.
+    period : float
+        Sampling period [ns].
+    hold : float
+        Tolerance [samples].
+    max_gap : float
+        A longer step ahead is a step of the clock [samples].
+    state, ring : ndarray
+        From `new_state`, changed in place.
+
+    Returns
+    -------
+    runs : ndarray of int64, shape (n_runs, 3)
+        First sample, first row, length; the last run stays open in the state.
+    events : ndarray of int64, shape (n_events, 5)
+        Cause, sample, row, stamp before [ns], stamp [ns].
+    """
+    runs = np.empty((2 * n + 2, 3), dtype=np.int64)
+    events = np.empty((2 * n + 2, 5), dtype=np.int64)
+    n_runs = n_events = 0
+    size = len(ring)
+    for j in range(n):
+        row, stamp = rows[j], stamps[j]
+        if stamp == NO_STAMP:
+            if state[STARTED] and (state[_ROW] + 1 + state[_PENDING] == row):
+                state[_PENDING] += 1
+            continue
+        if not state[STARTED]:
+            state[STARTED] = 1
+            state[FIRST] = state[_LATEST] = stamp
+            state[_STAMP0] = _origin(stamps, j, period)
+            state[_ROW] = state[_RUN_ROW] = row
+            state[_RUN_LENGTH] = 1
+            ring[0] = True
+            continue
+        head = state[_HEAD]
+        expected = head + 1
+        position = state[_GRID0] + (stamp - state[_STAMP0]) / period
+        pending = state[_PENDING]
+        state[_PENDING] = 0
+        if pending > 0 and state[_ROW] + 1 + pending == row and abs(position - (expected + pending)) <= hold:
+            for g in range(expected, expected + pending):
+                _occupy(ring, g - 1, g)
+            state[_RUN_LENGTH] += pending
+            state[_ROW] += pending
+            state[_HEAD] = head = head + pending
+            expected = head + 1
+        deviation = position - expected
+        target = expected
+        trusted = True  # whether the stamp says where the row belongs
+        if abs(deviation) > hold:
+            target = np.int64(np.rint(position))
+            if deviation > 0:
+                late = deviation < 1.5 and j + 1 < len(stamps) and stamps[j + 1] > stamp + 0.05 * period
+                if (late or deviation >= 1.5) and _fits(stamps, j, len(stamps), expected, state[_STAMP0], state[_GRID0], period, 2):
+                    target, trusted = expected, False
+                elif (stamp - state[_LATEST]) / period > max_gap:
+                    events[n_events] = (STEP, head + 1, row, state[_LATEST], stamp)
+                    n_events += 1
+                    target = head + 2
+                    state[_GRID0], state[_STAMP0] = target, _origin(stamps, j, period)
+            else:
+                free = target > head - size and target >= 0 and not ring[target % size]
+                if _persists(stamps, j, len(stamps), state[_LATEST]):
+                    elapsed = state[_LATEST] - state[_STAMP0]
+                    back = state[_LATEST] - stamp
+                    cause = RESTART if (stamp <= state[FIRST] + 0.1 * elapsed or 2 * back > elapsed) else STEP
+                    events[n_events] = (cause, head + 1, row, state[_LATEST], stamp)
+                    n_events += 1
+                    target = head + 2
+                    state[_GRID0], state[_STAMP0], state[_LATEST] = target, _origin(stamps, j, period), stamp
+                elif free and target >= state[_GRID0] and target <= head:
+                    events[n_events] = (OUT_OF_ORDER, target, row, state[_LATEST], stamp)
+                    n_events += 1
+                    ring[target % size] = True
+                    runs[n_runs] = (target, row, 1)
+                    n_runs += 1
+                    continue
+                elif deviation < -2.5 and _fits(stamps, j, len(stamps), expected, state[_STAMP0], state[_GRID0], period, 2):
+                    target, trusted = expected, False
+                else:
+                    cause = DUPLICATE if target >= head else OUT_OF_ORDER
+                    events[n_events] = (cause, max(target, state[_GRID0]), row, state[_LATEST], stamp)
+                    n_events += 1
+                    continue
+        if target == head + 1 and row == state[_ROW] + 1:
+            state[_RUN_LENGTH] += 1
+        else:
+            runs[n_runs] = (state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH])
+            n_runs += 1
+            state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH] = target, row, 1
+        _occupy(ring, head, target)
+        state[_HEAD], state[_ROW] = target, row
+        if trusted:
+            state[_LATEST] = max(state[_LATEST], stamp)
+    return runs[:n_runs].copy(), events[:n_events].copy()

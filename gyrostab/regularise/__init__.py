@@ -1,0 +1,214 @@
+"""Raw rows with their stamps to a regular log: uniform time, NaN at every missing sample, a table of gaps.
+
+No value is ever interpolated, averaged or moved by a fraction of a sample: a sample is a row of the file, bit for bit, or NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyrostab.errors import OptionError, TimeError
+from gyrostab.regularise.fill import gathered, on_grid
+from gyrostab.regularise.gaps import find_gaps, gap_table, gap_variables
+from gyrostab.regularise.notes import describe, describe_rate
+from gyrostab.regularise.place import Placement, place_by_count, place_by_stamp, place_without_time
+from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_rate, odd_stretches
+from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
+from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name
+from gyrostab.timegrid import time_coordinate
+
+__all__ = ["gap_table", "regularise"]
+
+_DISAGREE = 0.02  # a declared rate further off than this is a mistake
+_OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "history")
+
+
+def _seconds(max_gap: Any) -> float:
+    try:
+        seconds = float(max_gap) if isinstance(max_gap, int | float) else pd.Timedelta(max_gap).total_seconds()
+    except ValueError as error:
+        raise OptionError(f"max_gap={max_gap!r} is not a duration; write for instance '10D', '2h' or '30min'") from error
+    if not seconds > 0:
+        raise OptionError(f"max_gap={max_gap!r} must be longer than nothing; write for instance '10D', '2h' or '30min'")
+    return seconds
+
+
+def _checked(*, rate: float | None, tolerance: float, chunk: int, block: int) -> None:
+    if rate is not None and not (math.isfinite(rate) and rate > 0):
+        raise OptionError(f"rate={rate!r} is not a sampling rate; give a number of Hz above 0")
+    if not 0 <= tolerance < 0.5:
+        raise OptionError(f"tolerance={tolerance!r} must be at least 0 and below 0.5 samples")
+    if chunk < 1 or block < 64:
+        raise OptionError(f"chunk={chunk!r} and block={block!r} count samples and rows; give at least 1 and 64")
+
+
+def _declared(raw: xr.Dataset, rate: float | None) -> float | None:
+    value = rate if rate is not None else raw.attrs.get("declared_rate_hz")
+    return None if value is None else float(value)
+
+
+def _start(raw: xr.Dataset, notes: list[str]) -> int:
+    text = raw.attrs.get("start")
+    if not text:
+        notes.append(f"{file_of(raw)[0]}: no time in the file and no --start: the log is said to start at 1970-01-01T00:00:00")
+        return 0
+    try:
+        stamp = pd.Timestamp(text)
+    except ValueError as error:
+        raise OptionError(f"start {text!r} is not a date and time; write for instance 2026-03-11T10:45:14") from error
+    return int((stamp.tz_convert(None) if stamp.tzinfo else stamp).as_unit("ns").value)
+
+
+def _place(
+    raw: xr.Dataset, found: Survey, declared: float | None, *, tolerance: float, max_gap: float, block: int, notes: list[str]
+) -> tuple[Placement, float]:
+    where = file_of(raw)[0]
+    if "time" not in raw.variables:
+        if declared is None:
+            raise TimeError(f"{where}: the file has no time column; give the sampling rate with --rate HZ")
+        return place_without_time(found.rows, _start(raw, notes)), declared
+    everything = found.absent <= 0.01 * found.rows  # single unreadable rows took their time all the same
+    stamps: Stamps = partial(blocks, raw, found, block=block)
+    try:
+        estimate = estimate_rate(stamps, where=where)
+    except TimeError:
+        if declared is None or found.rows - found.absent > 1:
+            raise
+        estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
+    rate = estimate.rate
+    if declared is not None:
+        if abs(declared / estimate.raw - 1) > _DISAGREE:
+            raise TimeError(
+                f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz; leave out --rate to "
+                "use the stamps, or correct --rate, --epoch or the unit of the time column"
+            )
+        rate = declared
+    if estimate.counted:
+        placement = place_by_count(partial(stamps, all_rows=everything), estimate, rate, max_gap=max_gap)
+        odd = []
+    else:
+        placement = place_by_stamp(stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where)
+        odd = odd_stretches(stamps, 1e9 / rate)
+    notes += describe_rate(raw, estimate, rate, odd, placement)
+    return placement, rate
+
+
+def _channels(raw: xr.Dataset, found: Survey, placement: Placement, rate: float, chunk: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Channels and their own time coordinates."""
+    variables: dict[str, Any] = {}
+    coordinates: dict[str, Any] = {}
+    for name, rows in found.filled.items():
+        channel = raw[name]
+        if rows > 0.5 * (found.rows - found.absent):
+            variables[name] = ("time", on_grid(channel.data, placement, chunk=chunk), channel.attrs)
+        elif rows:
+            time, values = gathered(raw, name, placement, rate)
+            variables[name] = (f"time_{name}", values, channel.attrs)
+            coordinates[f"time_{name}"] = time
+    for key, variable in raw.data_vars.items():
+        if variable.dims == (f"time_{key}",):
+            variables[str(key)] = (variable.dims, variable.data, variable.attrs)
+            coordinates[f"time_{key}"] = raw[f"time_{key}"].variable
+    return variables, coordinates
+
+
+def _attributes(raw: xr.Dataset, kind: str, rate: float, done: str, notes: list[str]) -> dict[str, Any]:
+    kept = {key: value for key, value in raw.attrs.items() if key not in _OWN_ATTRIBUTES}
+    now = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
+    history = "\n".join(filter(None, [raw.attrs.get("history"), f"{now} gyrostab.regularise: {done}"]))
+    before = raw.attrs.get("notes", [])
+    said = [*([before] if isinstance(before, str) else before), *notes]
+    return {"source_files": [], **kept, "kind": kind, "sampling_rate_hz": rate, "history": history, "notes": said}
+
+
+def regularise(
+    raw: xr.Dataset,
+    *,
+    rate: float | None = None,
+    tolerance: float = 0.25,
+    max_gap: str | float = "10D",
+    chunk: int = 1_200_000,
+    block: int = BLOCK,
+) -> xr.Dataset:
+    """Put the rows of a raw log on a uniform time axis, with NaN at every missing sample and a table of gaps.
+
+    Parameters
+    ----------
+    raw : xarray.Dataset
+        From `gyrostab.read_log`: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree], ``time(row)``, channels.
+        A regular log is returned as it is.
+    rate : float, optional
+        Sampling rate [Hz]. Found from the stamps when not given; checked against them when given.
+    tolerance : float
+        A row takes the next sample while its stamp is less than half a sample plus this from it [samples].
+    max_gap : str or float
+        A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number is in seconds.
+    chunk : int
+        Samples of a chunk of the lazy arrays.
+    block : int
+        Rows in memory at one time; the result does not depend on it.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], channels, ``gap_start``, ``gap_end``, ``gap_samples``,
+        ``gap_rows``, ``gap_cause`` on ``gap``; attributes ``sampling_rate_hz``, ``kind``, ``source_files``, ``history``, ``notes``.
+
+    Raises
+    ------
+    TimeError
+        When no sampling rate can be found, or the one given is more than 2 % from what the stamps say.
+    FormatError
+        When no row holds a number.
+    OptionError, SchemaError
+        For an option or a dataset that makes no sense.
+
+    Notes
+    -----
+    Angle increments (kind "increment") become the mean rate over their sampling interval, increment times sampling rate.
+
+    Examples
+    --------
+    >>> time = np.array([0, 10, 20, 50, 60], dtype="datetime64[ms]").astype("datetime64[ns]")
+    >>> values = ("axis", "row"), np.array([[1.0, 2.0, 3.0, 6.0, 7.0]]), {"units": "degree hour-1"}
+    >>> log = regularise(xr.Dataset({"rate": values}, {"axis": ["z"], "time": ("row", time)}))
+    >>> log.rate.values
+    array([[ 1.,  2.,  3., nan, nan,  6.,  7.]])
+    >>> log.attrs["sampling_rate_hz"]
+    100.0
+    """
+    if "row" not in raw.dims and "sampling_rate_hz" in raw.attrs:
+        check_log(raw)
+        return raw
+    check_raw(raw)
+    _checked(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
+    gap_limit = _seconds(max_gap)
+    name = signal_name(raw)
+    found = survey(raw, name, block=block)
+    notes: list[str] = []
+    placement, hertz = _place(raw, found, _declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block, notes=notes)
+    table = find_gaps(placement, found)
+    notes += describe(raw, found, placement, table, hertz)
+
+    increments = raw.attrs.get("kind") == "increment"
+    signal = "rate" if increments else name
+    scale = hertz * 3600.0 if increments else 1.0  # degree a sample to degree an hour
+    attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
+    variables, own = _channels(raw, found, placement, hertz, chunk)
+    variables = {
+        signal: (("axis", "time"), on_grid(raw[name].data, placement, chunk=chunk, scale=scale), attributes),
+        **variables,
+        **gap_variables(table, placement.start, hertz),
+    }
+    coordinates = (
+        xr.Coordinates({"axis": raw["axis"].variable, **own}).merge(time_coordinate(placement.start, hertz, placement.size)).coords
+    )
+    done = f"{placement.placed} of {found.rows} rows on {placement.size} samples at {hertz:.10g} Hz"
+    return xr.Dataset(variables, coordinates, _attributes(raw, signal, hertz, done, notes))

@@ -1,0 +1,117 @@
+"""Samples from rows: lazy arrays on the grid, NaN where no row was placed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.kernels.stamps import NO_STAMP, RESTART, STEP
+from gyrostab.regularise.place import Placement
+from gyrostab.regularise.survey import BLOCK
+from gyrostab.timegrid import grid_times
+
+__all__ = ["SMALL", "gathered", "on_grid", "samples_of"]
+
+#: Numbers up to which an array is held in memory instead of being computed when needed.
+SMALL = 2_000_000
+
+
+def _fill(rows: NDArray[Any], *, runs: NDArray[np.int64], size: int, scale: float) -> NDArray[np.float64]:
+    """Rows (last dimension) to samples; `runs` count samples and rows from the beginning of both."""
+    out = np.full((*rows.shape[:-1], size), np.nan)
+    for sample, row, length in runs:
+        out[..., sample : sample + length] = rows[..., row : row + length]
+    out[np.isinf(out)] = np.nan
+    return out if scale == 1.0 else out * scale
+
+
+def _cut(runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int) -> NDArray[np.int64]:
+    """The parts of the runs that lie in the samples from `begin` to `end`."""
+    part = runs[np.searchsorted(ends, begin, side="right") : np.searchsorted(runs[:, 0], end, side="left")]
+    first = np.maximum(part[:, 0], begin)
+    last = np.minimum(part[:, 0] + part[:, 2], end)
+    return np.stack([first - begin, part[:, 1] + first - part[:, 0], last - first], axis=1)
+
+
+def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0) -> Any:
+    """An array by row as an array by sample, float64, NaN where there is no row and where a value is infinite.
+
+    Parameters
+    ----------
+    rows : array, shape (..., n_rows)
+        numpy, memmap or dask.
+    placement : Placement
+    chunk : int
+        Samples of a chunk of the result.
+    scale : float
+        Factor on the values.
+
+    Returns
+    -------
+    ndarray or dask.array.Array, shape (..., n_samples)
+        A numpy array when the result is small; chunks that are nothing but gap take no memory until they are computed.
+    """
+    size, lead = placement.size, rows.shape[:-1]
+    if size * max(1, int(np.prod(lead))) <= SMALL:
+        return _fill(np.asarray(rows), runs=placement.runs, size=size, scale=scale)
+    lazy = rows if isinstance(rows, da.Array) else da.from_array(rows, chunks=(*lead, BLOCK), name=False)
+    ends = placement.runs[:, 0] + placement.runs[:, 2]
+    parts, empty = [], 0
+
+    def flush() -> None:
+        nonlocal empty
+        if empty:
+            parts.append(da.full((*lead, empty), np.nan, chunks=(*lead, chunk), dtype=np.float64))
+        empty = 0
+
+    for begin in range(0, size, chunk):
+        end = min(size, begin + chunk)
+        runs = _cut(placement.runs, ends, begin, end)
+        if len(runs) == 0:
+            empty += end - begin
+            continue
+        flush()
+        first, last = int(runs[:, 1].min()), int((runs[:, 1] + runs[:, 2]).max())
+        runs[:, 1] -= first
+        source = lazy[..., first:last].rechunk(-1)
+        shape = (*((n,) for n in lead), (end - begin,))
+        parts.append(source.map_blocks(_fill, runs=runs, size=end - begin, scale=scale, dtype=np.float64, chunks=shape))
+    flush()
+    return da.concatenate(parts, axis=-1)
+
+
+def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sample of each row, -1 where the row was not placed."""
+    runs = placement.runs[np.argsort(placement.runs[:, 1], kind="stable")]
+    which = np.searchsorted(runs[:, 1], rows, side="right") - 1
+    inside = (which >= 0) & (rows < runs[which, 1] + runs[which, 2])
+    return np.where(inside, runs[which, 0] + rows - runs[which, 1], -1)
+
+
+def gathered(raw: xr.Dataset, name: str, placement: Placement, rate: float) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
+    """Stamps and values of the filled rows of a slow channel; rows without a sample keep their stamp, moved with their piece."""
+    channel = raw[name].data
+    clock = raw["time"].data if "time" in raw.variables else None
+    breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]
+    breaks = breaks[np.argsort(breaks[:, 2], kind="stable")]
+    moved = np.concatenate([[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]])
+    stamps, values = [], []
+    for begin in range(0, channel.shape[0], BLOCK):
+        block = np.asarray(channel[begin : begin + BLOCK], dtype=np.float64)
+        rows = np.flatnonzero(np.isfinite(block))
+        sample = samples_of(placement, rows + begin)
+        known = sample >= 0
+        when = grid_times(placement.start, rate, sample)
+        if clock is not None and not known.all():
+            written = np.asarray(clock[begin : begin + BLOCK]).astype("datetime64[ns]").view(np.int64)[rows]
+            own = written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
+            when = np.where(known, when, own)
+            known |= written != NO_STAMP
+        stamps.append(when[known])
+        values.append(block[rows][known])
+    time, first = np.unique(np.concatenate(stamps), return_index=True)
+    return time.view("datetime64[ns]"), np.concatenate(values)[first]

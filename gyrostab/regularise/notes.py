@@ -1,0 +1,120 @@
+"""What regularising did to a log, in sentences."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.kernels.stamps import DUPLICATE, OUT_OF_ORDER, RESTART
+from gyrostab.regularise.fill import samples_of
+from gyrostab.regularise.place import Placement
+from gyrostab.regularise.rate import RateEstimate
+from gyrostab.regularise.survey import Survey, file_of, stamp_text
+from gyrostab.schema import GAP_CAUSES
+from gyrostab.timegrid import grid_times
+
+__all__ = ["describe", "describe_rate", "duration"]
+
+_NAMED = 5  # of many events of one kind, so many are told one by one
+
+
+def duration(seconds: float) -> str:
+    """A duration as people say it.
+
+    Examples
+    --------
+    >>> duration(1068.0), duration(0.0045), duration(200 * 3600)
+    ('1068.0 s', '4.5 ms', '200.0 h')
+    """
+    if abs(seconds) < 1.0:
+        return f"{seconds * 1e3:.3g} ms"
+    return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def describe_rate(
+    raw: xr.Dataset, estimate: RateEstimate, rate: float, odd: list[tuple[int, int, float]], placement: Placement
+) -> list[str]:
+    """Sentences on the sampling rate."""
+    where = file_of(raw)[0]
+    notes = []
+    if estimate.counted:
+        why = "many rows share one stamp" if estimate.coarse else "the stamps come in bursts, as rows arrive and not as they are sampled"
+        reach = f"; stamps and samples differ by up to {duration(placement.wander / rate)} in the long run" if placement.wander >= 1 else ""
+        notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
+    off = abs(estimate.raw / rate - 1)
+    if off * placement.size > 1 and off > 2 * estimate.stderr / rate:
+        notes.append(f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million from the {rate:.10g} Hz used")
+    for row, stamp, own in odd[:_NAMED]:
+        file, local = file_of(raw, row)
+        notes.append(
+            f"{file}: from {stamp_text(stamp)} (row {local}) the samples come at {own:.6g} Hz and not at {rate:.6g} Hz; they are placed by their "
+            "stamps, so samples are missing or dropped there; split the log at that row and run the parts one by one"
+        )
+    return notes
+
+
+def _breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
+    notes = []
+    events = placement.events[placement.events[:, 0] >= min(GAP_CAUSES.index("clock_step"), RESTART)]
+    for cause, _sample, row, before, after in events[:_NAMED].tolist():
+        file, local = file_of(raw, row)
+        jump = (after - before) / 1e9
+        way = "back" if jump < 0 else "ahead"
+        what = "time restarts" if cause == RESTART else "the clock steps"
+        notes.append(
+            f"{file}: {what} at row {local}: from {stamp_text(before)} to {stamp_text(after)}, {duration(abs(jump))} {way}; the pause is of unknown "
+            "length, so the rows that follow come after one missing sample" + ("" if jump < 0 else "; if the pause is real, raise max_gap")
+        )
+    if len(events) > _NAMED:
+        notes.append(f"{file_of(raw)[0]}: {len(events) - _NAMED} more restarts and steps of the clock are in the table of gaps")
+    return notes
+
+
+def _missing(raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], rate: float) -> list[str]:
+    holes = table[(table[:, 4] == GAP_CAUSES.index("missing")) & (table[:, 2] > 0)]
+    if len(holes) == 0:
+        return []
+    notes = []
+    longest = holes[np.argsort(-holes[:, 2], kind="stable")]
+    longest = longest[longest[:, 2] >= max(2, rate)][:_NAMED]
+    ends = placement.runs[:, 0] + placement.runs[:, 2]
+    for first, _end, samples, _rows, _cause in longest.tolist():
+        before = placement.runs[np.searchsorted(ends, first)]
+        row = int(before[1] + before[2] - 1)
+        file, local = file_of(raw, row)
+        since = stamp_text(int(grid_times(placement.start, rate, first)))
+        notes.append(f"{file}: {duration(samples / rate)} without samples from {since} (after row {local})")
+    if len(holes) > len(longest):
+        total = int(holes[:, 2].sum())
+        share = total / placement.size
+        notes.append(
+            f"{file_of(raw)[0]}: {total} samples ({duration(total / rate)}, {share:.2g} of the log) are missing in {len(holes)} places; all are in the table of gaps"
+        )
+    return notes
+
+
+def describe(raw: xr.Dataset, found: Survey, placement: Placement, table: NDArray[np.int64], rate: float) -> list[str]:
+    """Sentences on gaps, restarts, and rows and cells that were dropped or moved."""
+    where = file_of(raw)[0]
+    notes = [*_breaks(raw, placement), *_missing(raw, placement, table, rate)]
+    events = placement.events
+    twice = events[events[:, 0] == DUPLICATE]
+    if len(twice):
+        file, local = file_of(raw, int(twice[:, 2].min()))
+        notes.append(f"{file}: {len(twice)} rows fall on a sample that is taken and were dropped, the first is row {local}")
+    late = events[events[:, 0] == OUT_OF_ORDER]
+    if len(late):
+        kept = int((samples_of(placement, late[:, 2]) >= 0).sum())
+        file, local = file_of(raw, int(late[:, 2].min()))
+        notes.append(
+            f"{file}: {len(late)} rows are out of order, the first is row {local}; {kept} were put in their place, {len(late) - kept} dropped"
+        )
+    lost = found.rows - found.absent - placement.placed - len(twice) - (len(late) - kept if len(late) else 0)
+    if lost > 0:
+        notes.append(f"{where}: {lost} rows without a readable time stamp were dropped, as their neighbours do not tell where they belong")
+    infinite = int((found.infinite[:, 1] - found.infinite[:, 0]).sum())
+    if infinite:
+        notes.append(f"{where}: {infinite} rows hold an infinite value, taken as missing")
+    notes += [f"{where}: axis {axis} never changes its value; is the sensor dead, or the column the wrong one?" for axis in found.constant]
+    return notes

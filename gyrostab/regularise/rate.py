@@ -1,0 +1,302 @@
+"""The sampling rate that a file's stamps stand for.
+
+Two hypotheses. *Lattice*: stamps lie near multiples of a period, with jitter, rounding, and rows missing or doubled; the
+row's place follows from its stamp. *Counted*: stamps tell when the rows arrived (in bursts) or are shared by many rows
+(whole seconds); only the number of rows over a long stretch tells the rate, and the row's place is its count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.errors import TimeError
+from gyrostab.kernels.stamps import NO_STAMP, track
+
+__all__ = ["RateEstimate", "Stamps", "estimate_rate", "odd_stretches", "starting_period"]
+
+SECOND = 1e9
+#: Gives the blocks of row numbers and stamps, from the first on, as often as asked.
+Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
+_GAIN = 0.1
+_SURE = 500.0  # samples over which the first estimate of the period may be trusted to count
+_MAX_PIECES = 200_000
+
+
+@dataclass(frozen=True)
+class RateEstimate:
+    """A sampling rate and how it was found.
+
+    Attributes
+    ----------
+    rate : float
+        Sampling rate [Hz].
+    stderr : float
+        Its standard error [Hz].
+    counted : bool
+        Rows are placed by their count, not by their stamps.
+    coarse : bool
+        Many rows share one stamp.
+    raw : float
+        The rate before it was rounded to a plain number [Hz].
+    """
+
+    rate: float
+    stderr: float
+    counted: bool
+    coarse: bool
+    raw: float
+
+
+def _pools(stamps: Stamps, *, size: int = 8192, most: int = 64) -> list[NDArray[np.int64]]:
+    """Stretches of stamps from all over the log, a few hundred thousand in all."""
+    found: list[NDArray[np.int64]] = []
+    for _, block in stamps():
+        block = block[block != NO_STAMP]
+        found += [block[i : i + size] for i in range(0, len(block), size)]
+        if len(found) > 2 * most:
+            found = found[::2]
+    return [part for part in found if len(part) > 1]
+
+
+def _residual_range(parts: list[NDArray[np.int64]], length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slope [ns a row] and range of the residuals [ns] of straight lines through stretches of `length` stamps."""
+    cut = [part[: len(part) // length * length].reshape(-1, length) for part in parts]
+    table = np.concatenate([*cut, np.empty((0, length), dtype=np.int64)])
+    values = (table - table[:, :1]).astype(np.float64)
+    x = np.arange(length) - (length - 1) / 2
+    slope = values @ x / (x @ x)
+    rest = values - slope[:, None] * x
+    return slope, np.ptp(rest, axis=1) if len(rest) else np.empty(0)
+
+
+def _shared(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
+    """Whether many rows share a stamp because the clock ticks slowly, and not because rows are doubled."""
+    if np.mean(steps == 0) < 0.05:
+        return False
+    tick = np.median(steps[steps > 0])
+    length = min(512, *(len(part) for part in parts)) if parts else 0
+    slope, spread = _residual_range(parts, length) if length >= 8 else (np.empty(0), np.empty(0))
+    good = slope > 0
+    return bool(good.any() and np.median(spread[good] / np.maximum(tick, slope[good])) < 1.3)
+
+
+def _refined(steps: NDArray[np.float64], period: float) -> float:
+    for _ in range(30):
+        near = np.abs(steps) < 5.5 * period
+        count = np.rint(steps[near] / period).sum()
+        if count <= 0:
+            return period
+        new = float(steps[near].sum() / count)
+        if abs(new - period) < 1e-12 * period:
+            break
+        period = new
+    return period
+
+
+def _on_a_line(parts: list[NDArray[np.int64]]) -> float | None:
+    """Period of the stretches in which the row count alone predicts the stamps to less than a sample."""
+    length = min(16, *(len(part) for part in parts))
+    slope, spread = _residual_range(parts, length)
+    good = (slope > 0) & (spread < 0.95 * slope)
+    if length < 4 or good.sum() < max(1, 0.03 * len(slope)):
+        return None
+    period = float(np.median(slope[good]))
+    for gain in (0.5, 0.5, 0.2, 0.1, _GAIN):
+        time = samples = 0
+        for part in parts:
+            count, piece = track(part, period, gain, 20 * period)
+            same = np.diff(piece) == 0
+            time, samples = time + int(np.diff(part)[same].sum()), samples + int(np.diff(count)[same].sum())
+        if samples <= 0:
+            return None
+        period = time / samples
+    return period
+
+
+def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
+    """Period [ns] from stretches of stamps, to a part in a thousand or better; whether rows are counted; whether stamps are shared."""
+    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
+    rising = steps[steps > 0]
+    if _shared(parts, steps):
+        return _throughput(parts, ticks=True), True, True
+    period = _on_a_line(parts) or _refined(steps, float(np.median(rising)))
+    long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
+    near = steps[np.abs(steps) < 50 * period]
+    if len(long) > max(10, 0.02 * len(steps)) and near.sum() > 1.2 * period * len(near):
+        if abs(np.exp(2j * np.pi * long / period).mean()) < 0.2:
+            return _throughput(parts), True, False
+    return period, False, False
+
+
+def _throughput(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
+    """Time a row takes [ns], from long stretches; with `ticks`, from the first to the last change of a shared stamp."""
+    rates = []
+    for part in parts:
+        steps = np.diff(part).astype(np.float64)
+        rising = np.flatnonzero(steps > 0)
+        if ticks and len(rising) > 1:
+            steps = steps[rising[0] + 1 : rising[-1] + 1]
+        usual = np.median(steps[steps > 0]) if (steps > 0).any() else SECOND
+        good = (steps >= 0) & (steps <= max(SECOND, 1000 * usual) if not ticks else steps <= 3 * usual)
+        if good.any() and steps[good].sum() > 0:
+            rates.append((steps[good].sum(), good.sum()))
+    times, counts = np.array(rates, dtype=np.float64).T
+    whole = counts >= 0.5 * counts.max()
+    return float(np.median(times[whole] / counts[whole]))
+
+
+def _longest(parts: list[NDArray[np.int64]], period: float) -> float:
+    """Step [ns] after which counting starts anew when rows are placed by count."""
+    steps = np.concatenate([np.diff(part) for part in parts])
+    return float(max(SECOND, 50 * period, 10 * np.quantile(np.abs(steps), 0.99)))
+
+
+def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest: float) -> NDArray[np.float64]:
+    """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
+    table: list[tuple[float, ...]] = []
+    zero: int | None = None
+    for _, block in stamps():
+        block = block[block != NO_STAMP]
+        if len(block) == 0:
+            continue
+        zero = int(block[0]) if zero is None else zero
+        if counted:
+            piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
+            count = np.arange(len(block))
+        else:
+            count, piece = track(block, period, _GAIN, longest)
+        if coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1:  # only there the true time is known
+            block, count, piece = block[tick], count[tick], piece[tick]
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(piece)) + 1, [len(block)]])
+        for a, b in zip(edges[:-1], edges[1:], strict=True):
+            c, t = count[a:b].astype(np.float64), (block[a:b] - zero).astype(np.float64)
+            mc, mt = c.mean(), t.mean()
+            c, t = c - mc, t - mt
+            cc, ct = c @ c, c @ t
+            rest = t - (ct / cc if cc else period) * c
+            table.append((b - a, mc, mt, cc, ct, rest @ rest))
+        if len(table) > _MAX_PIECES:  # a log in shreds: the largest pieces tell the rate
+            table = sorted(table, key=lambda row: -row[3])[: _MAX_PIECES // 2]
+            table.sort(key=lambda row: row[2])
+    return np.array(table, dtype=np.float64)
+
+
+def _pooled(pieces: NDArray[np.float64], period: float, counted: bool) -> tuple[float, float, float]:
+    """Period [ns], its standard error [ns], and the samples of the longest joined stretch."""
+    n, cc, ct, rest = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
+    if cc.sum() <= 0:
+        return period, period, 1.0
+    noise = np.sqrt(rest.sum() / max(1.0, n.sum() - 2 * len(n)))
+    slope = ct / np.where(cc > 0, cc, 1.0)
+    sane = (cc > 0) & (np.abs(slope / period - 1) < 0.02 + 5 * noise / period / np.sqrt(np.maximum(cc, 1e-9)))
+    if sane.any():
+        period = float(ct[sane].sum() / cc[sane].sum())
+    error = 3.0 * noise / np.sqrt(cc[sane].sum() if sane.any() else cc.sum())
+    if counted:
+        return period, error, float(n.max())
+    return _joined(pieces[sane], period, error, noise)
+
+
+def _joined(pieces: NDArray[np.float64], period: float, error: float, noise: float) -> tuple[float, float, float]:
+    """Join pieces whose distance is surely a known number of samples, and fit again."""
+    for _ in range(3):
+        total_cc = total_ct = longest = 0.0
+        n, mc, mt, cc, ct = pieces[0, :5]
+        for n2, mc2, mt2, cc2, ct2 in pieces[1:, :5]:
+            apart = (mt2 - mt) / period
+            if apart > 0 and (apart * error + 3 * noise / np.sqrt(min(n, n2))) / period < 0.2:
+                shift = np.rint(apart - (mc2 - mc)) + mc2 - mc  # distance of the mean counts
+                weight, share = n * n2 / (n + n2), n2 / (n + n2)
+                cc, ct = cc + cc2 + weight * shift**2, ct + ct2 + weight * shift * (mt2 - mt)
+                mc, mt, n = mc + shift * share, mt + (mt2 - mt) * share, n + n2
+            else:
+                total_cc, total_ct, longest = total_cc + cc, total_ct + ct, max(longest, n)
+                n, mc, mt, cc, ct = n2, mc2, mt2, cc2, ct2
+        total_cc, total_ct, longest = total_cc + cc, total_ct + ct, max(longest, n)
+        if total_cc > 0:
+            period, error = float(total_ct / total_cc), 3.0 * noise / np.sqrt(total_cc)
+    return period, error, float(longest)
+
+
+def _plain(rate: float, error: float, samples: float, counted: bool) -> float:
+    """A number that people would have chosen, when the estimate cannot tell it from itself."""
+    room = error if counted else min(error, 0.5 * rate / max(samples, 1.0))
+    candidates = [float(round(rate))] if rate > 0.5 else []
+    period_ms = 1000.0 / rate
+    if period_ms >= 1.5:
+        candidates.append(1000.0 / round(period_ms))
+    candidates += [round(rate, digits) for digits in (1, 2, 3)]
+    for candidate in candidates:
+        if candidate > 0 and abs(candidate - rate) <= room:
+            return candidate
+    return float(f"{rate:.13g}")
+
+
+def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
+    """Find the sampling rate from the stamps.
+
+    Parameters
+    ----------
+    stamps : callable
+        Gives an iterator over blocks of (row numbers, stamps [ns]).
+    where : str
+        The file, for messages.
+
+    Returns
+    -------
+    RateEstimate
+
+    Raises
+    ------
+    TimeError
+        When there are not two different stamps, or time runs backwards.
+
+    Examples
+    --------
+    >>> stamps = np.rint(np.arange(1000) * 1e3 / 300).astype(np.int64) * 1_000_000  # 300 Hz, written to the millisecond
+    >>> estimate_rate(lambda: iter([(np.arange(1000), stamps)]), where="tool.csv").rate
+    300.0
+    """
+    parts = _pools(stamps)
+    if not parts:
+        raise TimeError(
+            f"{where}: there is only one sample with a readable stamp, so no sampling rate can be found; give it with --rate HZ"
+        )
+    steps = np.concatenate([np.diff(part) for part in parts])
+    if not (steps > 0).any() or (steps < 0).mean() > 0.5:
+        what = "time runs backwards" if (steps < 0).any() else "all stamps are the same"
+        raise TimeError(f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ")
+    period, counted, coarse = starting_period(parts)
+    longest = _longest(parts, period) if counted else _SURE * period
+    pieces = _pieces(stamps, period, counted, coarse, longest)
+    period, error, samples = _pooled(pieces, period, counted and not coarse)
+    rate = SECOND / period
+    stderr = rate * error / period
+    return RateEstimate(_plain(rate, stderr + 1e-12 * rate, samples, counted and not coarse), stderr, counted, coarse, rate)
+
+
+def odd_stretches(stamps: Stamps, period: float, *, size: int = 1024) -> list[tuple[int, int, float]]:
+    """Stretches whose own rate is more than 2 % off: first row, its stamp [ns], rate [Hz].
+
+    Rows that are merely missing or doubled do not make a stretch odd; steps of another length do.
+    """
+    found: list[tuple[int, int, float]] = []
+    inside = False
+    for rows, values in stamps():
+        known = values != NO_STAMP
+        rows, values = rows[known], values[known]
+        for begin in range(0, len(values) - 63, size):
+            part = values[begin : begin + size]
+            if len(part) < 64:
+                break
+            pace = float(np.median(np.diff(part[::16]))) / 16
+            own = None if abs(pace / period - 1) < 0.02 else _on_a_line([part])
+            odd = own is not None and abs(own / period - 1) > 0.02
+            if odd and not inside and own is not None:
+                found.append((int(rows[begin]), int(part[0]), SECOND / own))
+            inside = odd
+    return found

@@ -1,0 +1,141 @@
+"""One pass over a raw log: which rows hold a sample, which cells are no numbers, how full the channels are."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError
+from gyrostab.kernels.stamps import NO_STAMP
+
+__all__ = ["BLOCK", "Survey", "blocks", "file_of", "stamp_text", "survey"]
+
+#: Rows that are held in memory at one time.
+BLOCK = 1 << 20
+
+
+@dataclass
+class Survey:
+    """What one pass over the signal found.
+
+    Attributes
+    ----------
+    rows : int
+        Rows of the raw log.
+    present : ndarray of uint8
+        One bit a row: some axis has a number.
+    absent : int
+        Rows without any number.
+    unreadable, infinite : ndarray of int64, shape (n, 2)
+        Half-open spans of present rows in which an axis is NaN, or infinite.
+    constant : list of str
+        Axes whose value never changes.
+    filled : dict
+        Channel on ``row`` -> rows that have a number.
+    """
+
+    rows: int
+    present: NDArray[np.uint8]
+    absent: int
+    unreadable: NDArray[np.int64]
+    infinite: NDArray[np.int64]
+    constant: list[str]
+    filled: dict[str, int] = field(default_factory=dict)
+
+    def mask(self, begin: int, end: int) -> NDArray[np.bool_]:
+        """Rows `begin` to `end` that hold a sample."""
+        bits = np.unpackbits(self.present[begin // 8 : -(-end // 8)])
+        return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
+
+
+def _spans(bad: NDArray[np.bool_], offset: int) -> NDArray[np.int64]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
+    return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
+
+
+def _join(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    spans = np.concatenate([*parts, np.empty((0, 2), dtype=np.int64)])
+    if len(spans) < 2:
+        return spans
+    new = np.concatenate([[True], spans[1:, 0] != spans[:-1, 1]])  # a span that goes on in the next block is one span
+    starts = np.flatnonzero(new)
+    ends = np.append(starts[1:], len(spans)) - 1
+    return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
+
+
+def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
+    """Look at every cell of a raw log once.
+
+    Raises
+    ------
+    FormatError
+        When no row holds a number.
+    """
+    signal = raw[name].data
+    n_axes, rows = signal.shape
+    block -= block % 8
+    bits, unreadable, infinite = [], [], []
+    absent = 0
+    low, high = np.full(n_axes, np.inf), np.full(n_axes, -np.inf)
+    channels = [str(key) for key, variable in raw.data_vars.items() if variable.dims == ("row",)]
+    filled = dict.fromkeys(channels, 0)
+    for begin in range(0, rows, block):
+        end = min(rows, begin + block)
+        cells = np.asarray(signal[:, begin:end])
+        nan = np.isnan(cells)
+        present = ~nan.all(axis=0)
+        absent += int((~present).sum())
+        bits.append(np.packbits(present))
+        unreadable.append(_spans(nan.any(axis=0) & present, begin))
+        infinity = np.isinf(cells)
+        infinite.append(_spans(infinity.any(axis=0), begin))
+        usable = np.where(nan | infinity, np.nan, cells)
+        low, high = np.fmin(low, np.fmin.reduce(usable, axis=1)), np.fmax(high, np.fmax.reduce(usable, axis=1))
+        for key in channels:
+            filled[key] += int(np.isfinite(np.asarray(raw[key].data[begin:end])).sum())
+    if rows == 0 or absent == rows or not np.any(low <= high):
+        raise FormatError(
+            f"{_sources(raw)}: none of the {rows} rows holds a number for any gyro axis; check the columns, the units and --map"
+        )
+    axes = [str(axis) for axis in raw["axis"].values]
+    still = [axis for axis, least, most in zip(axes, low, high, strict=True) if least == most and rows - absent > 1]
+    packed = np.concatenate(bits)
+    return Survey(rows, packed, absent, _join(unreadable), _join(infinite), still, filled)
+
+
+def blocks(
+    raw: xr.Dataset, found: Survey, *, block: int = BLOCK, all_rows: bool = False
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Row numbers and stamps [ns, `NO_STAMP` where unreadable] of the rows that hold a sample, block by block."""
+    stamps = raw["time"].data
+    for begin in range(0, found.rows, block):
+        end = min(found.rows, begin + block)
+        values = np.asarray(stamps[begin:end]).astype("datetime64[ns]").view(np.int64)
+        keep = np.ones(end - begin, dtype=bool) if all_rows else found.mask(begin, end)
+        yield np.flatnonzero(keep) + begin, values[keep]
+
+
+def _sources(raw: xr.Dataset) -> str:
+    names = raw.attrs.get("source_files") or ["the raw log"]
+    return ", ".join(map(str, [names] if isinstance(names, str) else names))
+
+
+def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:
+    """The source file that a row of the raw log comes from, and the row's number in it, counted from 0."""
+    names = raw.attrs.get("source_files") or ["the raw log"]
+    names = [names] if isinstance(names, str) else list(names)
+    starts = [int(start) for start in np.atleast_1d(raw.attrs.get("row_start", 0))]
+    if len(starts) != len(names):
+        return ", ".join(map(str, names)), row
+    which = max(0, bisect_right(starts, row) - 1)
+    return str(names[which]), row - starts[which]
+
+
+def stamp_text(stamp: int) -> str:
+    """A stamp [ns since 1970] as ISO 8601, to the millisecond."""
+    return "no stamp" if stamp == NO_STAMP else str(np.datetime64(int(stamp), "ns").astype("datetime64[ms]"))
