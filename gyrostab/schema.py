@@ -63,6 +63,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
     "coverage": {"long_name": "second differences used, share of the gap-free number", "units": "1"},
     "edf": {"long_name": "equivalent degrees of freedom of the Allan variance", "units": "1"},
     "estimator": {"long_name": "estimator of the Allan variance", **_flags(ESTIMATORS)},
+    "gap_factor": {"long_name": "degrees of freedom left by the gaps, share of the gap-free ones", "units": "1"},
     "white_response": {
         "long_name": "Allan variance of angle random walk seen through the gaps, as a share of the gap-free law",
         "units": "1",

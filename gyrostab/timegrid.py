@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from xarray.core.indexing import IndexSelResult
 from xarray.indexes import CoordinateTransform, CoordinateTransformIndex
 
-__all__ = ["TimeGridIndex", "grid_index", "grid_times", "period_ns", "time_coordinate"]
+__all__ = ["TimeGridIndex", "first_stamp", "grid_index", "grid_times", "period_ns", "time_coordinate"]
 
 NANOSECONDS = 10**9
 
@@ -64,6 +64,12 @@ def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
     """Position on the grid, in samples and fractions of one, of `stamps` [ns since 1970]."""
     whole, fraction = period_ns(rate)
     return np.asarray((np.asarray(stamps, dtype=np.int64) - start) / (whole + fraction))
+
+
+def first_stamp(log: xr.Dataset) -> int:
+    """Stamp of the first sample of a log [ns since 1970], without computing the others."""
+    first = np.asarray(log["time"].isel(time=0).values).astype("datetime64[ns]")
+    return int(first.astype(np.int64).ravel()[0])
 
 
 class _GridTransform(CoordinateTransform):

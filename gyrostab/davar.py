@@ -1,0 +1,302 @@
+"""Dynamic Allan variance: a log to a surface ``(axis, time, tau)``. All chunking and every dask call of it live here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import dask
+import dask.array as da
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.channels import window_channels
+from gyrostab.errors import OptionError
+from gyrostab.kernels.covariance import pair_products, ramp_products
+from gyrostab.kernels.least_squares import identify_noise
+from gyrostab.kernels.pairs import white_pair_sum
+from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_theta
+from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
+from gyrostab.noise import HOUR, avar_columns
+from gyrostab.schema import attributes, check_log, signal_name
+from gyrostab.timegrid import first_stamp, grid_times
+from gyrostab.windows import averaging_factors, samples, thin
+
+__all__ = ["davar"]
+
+_METHODS = ("blocks", "direct", "recursive")
+_GAPS = ("bridge", "zero")
+_OVERLAPS = ("full", "octave")
+_CONVENTIONS = ("all", "paper")
+
+
+def davar(
+    log: xr.Dataset,
+    *,
+    window: Any,
+    step: Any = None,
+    taus: Any = 40,
+    tau_max: Any = None,
+    axis: str | Sequence[str] | None = None,
+    overlap: str = "full",
+    gaps: str = "bridge",
+    min_strict: float = 0.3,
+    min_coverage: float = 0.1,
+    method: str = "blocks",
+    convention: str = "all",
+) -> xr.Dataset:
+    """Dynamic overlapping Allan variance of a gyro log (improved fast DAVAR).
+
+    A window slides along the record; inside it the Allan variance is the mean squared second difference of the angle,
+
+        avar(t, tau) = < (theta[m + 2k] - 2 theta[m + k] + theta[m])^2 > / (2 tau^2),   tau = k / sampling rate,
+
+    over all ``window - 2k + 1`` positions m. Missing samples are passed over, never filled.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        Regular log with ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], NaN where a sample is
+        missing, numpy or dask, float or integer. A dask log stays lazy and gives the same bits for any chunking.
+    window, step : str, timedelta or int
+        Length and step of the window: a duration (``"10min"``), or a number of samples (``2000`` or ``"2000samples"``).
+        `step` defaults to a tenth of the window.
+    taus : int, {"octave", "all"} or sequence
+        Averaging times: so many, spaced evenly in log tau; powers of two samples; every one; or a list [s]
+        (numbers, or strings such as ``"0.1s"``). Each is moved to a whole number of samples and reported exactly.
+    tau_max : float or str, optional
+        Longest averaging time [s]; a third of the window by default (L13), at most half of it.
+    axis : str or sequence of str, optional
+        Axes to use; all by default.
+    overlap : {"full", "octave"}
+        Use every second difference, or for ``k >= 16`` one in k/16 to k/8 of them, with k moved to a multiple of a power
+        of two: three times faster on long windows, with 1 % more scatter.
+    gaps : {"bridge", "zero"}
+        ``"bridge"`` counts only what is there. In a rate log those are terms inside unbroken runs, and, where fewer than
+        `min_strict` of them are left, weighted cluster means (see ``estimator``). In an angle log they are terms whose
+        three angles are there. ``"zero"`` divides by the gap-free number instead, which lowers the surface at
+        every gap: the "canyon" of P16.
+    min_strict, min_coverage : float
+        Share of terms in unbroken runs below which cluster means are used; coverage below which a cell is NaN.
+    method : {"blocks", "direct", "recursive"}
+        The default; the classical DAVAR (P16 Eq. 16); the published recursion (P16 Eq. 19-22). The last two load the log
+        and are there for comparison.
+    convention : {"all", "paper"}
+        With ``"paper"`` the reference methods count ``window - 2k`` terms, and leave out the last window, as P16 does.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``avar, count, coverage, edf, estimator, white_response, quantization_response (axis, time, tau)``,
+        ``window_mean, window_coverage (axis, time)``, and every channel of the log averaged over each window; ``time`` is
+        the centre of the window, with ``time_bounds``; ``tau`` [s]. Units stand on the variables.
+
+    Raises
+    ------
+    OptionError
+        When window, step or taus do not fit the record or each other; the message says which and what would.
+    SchemaError
+        When `log` is not a regular log.
+
+    References
+    ----------
+    P16: Wang et al., Sensors 16 (2016), Eq. 16-22. L13: Li et al., Chin. J. Lasers 40 (2013) 0908004.
+    Degrees of freedom: Greenhall and Riley, PTTI 2003.
+
+    Examples
+    --------
+    >>> from gyrostab.log import make_log
+    >>> noise = np.random.default_rng(1).standard_normal(60_000)
+    >>> surface = davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min", step="30s", taus=[0.01, 1.0])
+    >>> surface.avar.sel(axis="x").dims, surface.sizes["time"]
+    (('time', 'tau'), 19)
+    >>> float(surface.avar.sel(tau=1.0).mean()) * 100  # white noise: avar = sd^2 / k
+    0.98...
+    """
+    check_log(log)
+    _check_choices(method=method, gaps=gaps, overlap=overlap, convention=convention)
+    name = signal_name(log)
+    signal = log[name] if axis is None else _pick(log[name], axis)
+    rate = float(log.attrs["sampling_rate_hz"])
+    intervals = signal.sizes["time"] - (1 if name == "angle" else 0)
+    length, hop = _window_and_step(window, step, rate, intervals)
+    ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max)
+    shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
+    ks = np.unique(ks >> shifts << shifts)
+    shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
+    unit = Unit(length, hop, ks, shifts, name == "angle", 1.0 / rate, gaps == "zero", min_strict, min_coverage)
+    if method == "blocks":
+        cells, means = _blocks(signal.data, unit, rate)
+    else:
+        cells, means = _reference(signal, unit, rate, method, paper=convention == "paper")
+    surface = _label(cells, means, log, signal, unit, rate)
+    surface.attrs.update(
+        {
+            "window_s": length / rate, "step_s": hop / rate, "window_samples": length, "step_samples": hop,
+            "method": method, "overlap": overlap, "gaps": gaps, "convention": convention,
+            "min_strict": min_strict, "min_coverage": min_coverage,
+        }
+    )  # fmt: skip
+    return surface
+
+
+def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> None:
+    for option, value, choices in (
+        ("method", method, _METHODS),
+        ("gaps", gaps, _GAPS),
+        ("overlap", overlap, _OVERLAPS),
+        ("convention", convention, _CONVENTIONS),
+    ):
+        if value not in choices:
+            raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
+    if convention == "paper" and method == "blocks":
+        raise OptionError("convention='paper' is for method='direct' and method='recursive'; the block sums use all terms")
+    if overlap == "octave" and method != "blocks":
+        raise OptionError(f"overlap='octave' is for method='blocks'; method={method!r} uses every term")
+
+
+def _pick(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
+    wanted = [axis] if isinstance(axis, str) else list(axis)
+    known = [str(name) for name in signal["axis"].values]
+    unknown = [name for name in wanted if name not in known]
+    if unknown or not wanted:
+        raise OptionError(f"axis {unknown or wanted} is not in the log; it has {known}")
+    return signal.sel(axis=wanted)
+
+
+def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tuple[int, int]:
+    length = samples(window, rate, "window")
+    if length > available:
+        raise OptionError(
+            f"the window of {length / rate:g} s ({length} samples) is longer than the record of {available / rate:g} s; give a shorter --window"
+        )
+    if length < 4:
+        raise OptionError(f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at {rate:g} Hz)")
+    hop = max(1, length // 10) if step is None else samples(step, rate, "step")
+    if hop > length:
+        raise OptionError(
+            f"the step of {hop / rate:g} s is longer than the window of {length / rate:g} s, so samples would be left out; give a shorter --step"
+        )
+    return length, hop
+
+
+def _units_of_work(n_samples: int, unit: Unit) -> list[tuple[int, int]]:
+    """First and one-past-last sample of each unit of work; they depend on the windows alone, not on any chunking."""
+    points = unit.window + (1 if unit.angle else 0)
+    n_windows = (n_samples - points) // unit.step + 1
+    per_unit = max(8, (max(4 * unit.window, 2**18) - unit.window) // unit.step)
+    return [
+        (first * unit.step, (min(first + per_unit, n_windows) - 1) * unit.step + points) for first in range(0, n_windows, per_unit)
+    ]
+
+
+def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Cells (8, n_windows, n_tau), the last field the degrees of freedom, and means (2, n_windows) of one unit."""
+    x = np.ascontiguousarray(x)
+    cells = surface_unit(x, unit)
+    scale = HOUR if unit.angle else 1.0  # angles are in degree, so their slopes in degree per second
+    cells[0] *= scale**2
+    dof = identify_noise(cells[0], cells[5], cells[6], cells[3], *tables)
+    means = window_means(x, unit)
+    means[0] *= scale
+    return np.concatenate([cells, dof[None]]), means
+
+
+def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
+    """What `identify_noise` needs: columns, first weights, conversion to sample units, and the pair sums of each tau."""
+    columns = avar_columns(unit.ks / rate)
+    to_samples = sample_squares(rate)
+    n = [int(unit.window - 2 * k + 1) for k in unit.ks]
+    weight = np.array([count**2 / white_pair_sum(count, int(k)) for count, k in zip(n, unit.ks, strict=True)])
+    one = [(unit.ks[i : i + 1], unit.shifts[i : i + 1]) for i in range(unit.ks.size)]
+    pairs = np.stack([pair_products(unit.window, k, s)[:, :, 0, 0] for k, s in one], axis=-1)
+    ramps = np.stack([ramp_products(unit.window, k, s)[:, 0, 0] for k, s in one], axis=-1)
+    return columns, weight, to_samples, pairs, ramps
+
+
+def sample_squares(rate: float) -> NDArray[np.float64]:
+    """Squared coefficients of the five terms in sample units (rate per sample in degree per hour), per squared coefficient."""
+    one_sample = np.array([3.0, 1.0, 2.0 * np.log(2.0) / np.pi, 1.0 / 3.0, 0.5])
+    return np.asarray(avar_columns(1.0 / rate) / one_sample)
+
+
+def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
+    """Run the units of work: cells (8, axis, time, tau) and means (2, axis, time), dask if `data` is."""
+    lazy = isinstance(data, da.Array)
+    tables = _noise_tables(unit, rate)
+    shared = dask.delayed(tables, pure=True, traverse=False) if lazy else tables
+    work = dask.delayed(_work, nout=2, pure=False)
+    rows_cells, rows_means = [], []
+    for row in range(data.shape[0]):
+        cells, means = [], []
+        for start, stop in _units_of_work(data.shape[1], unit):
+            n = (stop - start - unit.window - (1 if unit.angle else 0)) // unit.step + 1
+            one_cells, one_means = work(data[row, start:stop], unit, shared)
+            cells.append(da.from_delayed(one_cells, (len(CELL_FIELDS) + 1, n, unit.ks.size), dtype=np.float64))
+            means.append(da.from_delayed(one_means, (2, n), dtype=np.float64))
+        rows_cells.append(da.concatenate(cells, axis=1))
+        rows_means.append(da.concatenate(means, axis=1))
+    stacked = da.stack(rows_cells, axis=1), da.stack(rows_means, axis=1)
+    return stacked if lazy else dask.compute(*stacked)
+
+
+def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool) -> tuple[Any, Any]:
+    """The published algorithms, eager: cells (8, axis, time, tau) and means (2, axis, time)."""
+    points = unit.window + (0 if paper and not unit.angle else 1)
+    all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
+    n_windows = (all_points - points) // unit.step + (0 if paper else 1)
+    if n_windows < 1:
+        raise OptionError("the paper's convention leaves no window: it leaves out the last one; give a longer record")
+    run = direct_sums if method == "direct" else recursive_sums
+    tables = _noise_tables(unit, rate)
+    full = (points - 2 * unit.ks).astype(np.float64)
+    cells = np.zeros((len(CELL_FIELDS) + 1, signal.sizes["axis"], n_windows, unit.ks.size))
+    means = np.zeros((2, signal.sizes["axis"], n_windows))
+    for row in range(signal.sizes["axis"]):
+        x = np.asarray(signal.isel(axis=row).data)
+        theta, present, missing = reference_theta(x, angle=unit.angle, paper=paper)
+        sums, counts = run(theta, present, missing, points, unit.step, n_windows, unit.ks)
+        divisor = full if unit.zero_fill else counts
+        interval = unit.interval if unit.angle else 1.0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cells[0, row] = sums / (2.0 * (unit.ks * interval) ** 2 * divisor) * (HOUR**2 if unit.angle else 1.0)
+        cells[1, row], cells[2, row] = counts, counts / full
+        cells[3, row], cells[4, row], cells[5:7, row] = counts / full, STRICT, 1.0
+        if not unit.zero_fill:
+            cells[0, row][cells[2, row] < unit.min_coverage] = np.nan
+        cells[7, row] = identify_noise(cells[0, row], cells[5, row], cells[6, row], cells[3, row], *tables)
+        means[:, row] = window_means(x, unit)[:, :n_windows]
+        means[0, row] *= HOUR if unit.angle else 1.0
+    return cells, means
+
+
+def _label(cells: Any, means: Any, log: xr.Dataset, signal: xr.DataArray, unit: Unit, rate: float) -> xr.Dataset:
+    cube, plane = ("axis", "time", "tau"), ("axis", "time")
+    start = first_stamp(log)
+    first = np.arange(cells.shape[2]) * unit.step
+    bounds = np.stack([grid_times(start, rate, first), grid_times(start, rate, first + unit.window)], axis=-1)
+    centre = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
+    names = (*CELL_FIELDS, "edf")
+    integers = {"count": np.int64, "estimator": np.int8}
+    variables: dict[str, Any] = {
+        name: (cube, cells[i].astype(integers[name]) if name in integers else cells[i], attributes(name))
+        for i, name in enumerate(names)
+        if name != "gap_factor"
+    }
+    variables["window_mean"] = (plane, means[0], attributes("window_mean"))
+    variables["window_coverage"] = (plane, means[1], attributes("window_coverage"))
+    surface = xr.Dataset(
+        variables,
+        coords={
+            "axis": ("axis", signal["axis"].values, attributes("axis")),
+            "time": ("time", pd.DatetimeIndex(centre.view("datetime64[ns]")), {**attributes("time")}),
+            "tau": ("tau", unit.ks / rate, attributes("tau")),
+            "time_bounds": (("time", "bnds"), bounds.view("datetime64[ns]")),
+        },
+        attrs=dict(log.attrs),
+    )
+    # The share of degrees of freedom that the gaps leave is what a fit needs beside the responses.
+    surface["gap_factor"] = (cube, cells[CELL_FIELDS.index("gap_factor")], attributes("gap_factor"))
+    return surface.assign(window_channels(log, bounds, first, first + unit.window))

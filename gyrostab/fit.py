@@ -1,0 +1,227 @@
+"""Surface to coefficients: Q, N, B, K and R of every window, with errors, upper limits and what is observable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from gyrostab.davar import sample_squares
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.kernels.covariance import pair_products, ramp_products
+from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
+from gyrostab.kernels.pairs import white_pair_sum
+from gyrostab.noise import LAWS, TERMS, avar_columns
+from gyrostab.schema import attributes, check_surface
+from gyrostab.windows import thin
+
+__all__ = ["fit_noise"]
+
+#: Averaging times used at most; more of them share the same information and cost the cube of their number.
+MOST_TAUS = 48
+#: One-sided normal quantiles: 95 % for limits, 99 % for the claim that a term is there.
+_LIMIT, _CLAIM = 1.6449, 2.3263
+#: A column that the other terms imitate to all but this share cannot be told apart.
+_SEPARATION = 1e-4
+
+
+def fit_noise(surface: xr.Dataset, *, terms: str | Iterable[str] = "QNBKR", method: str = "gls") -> xr.Dataset:
+    """Fit the five-term noise model to every window of a surface.
+
+    The Allan variance is linear in the squared coefficients,
+
+        avar(tau) = 3 Q^2 / tau^2 + N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 + R^2 tau^2 / 2,
+
+    so they follow from non-negative generalised least squares. The covariance between averaging times (overlapping
+    estimates share data) is that of the fitted noise itself, found by iteration. Where gaps forced weighted cluster
+    means, the columns of Q and N are those that the mask predicts.
+
+    Parameters
+    ----------
+    surface : xarray.Dataset
+        What `gyrostab.davar` returns.
+    terms : str or iterable of str
+        Terms to fit, a selection of Q, N, B, K, R; the others are taken as zero.
+    method : {"gls", "adev"}
+        The default, or the fit of deviations of P15 (Eq. 3), ``sigma = sum C_n tau^(n/2)``, unweighted. It adds
+        deviations where variances add, gives no errors, and is there for comparison.
+
+    Returns
+    -------
+    xarray.Dataset
+        The surface, and per ``(axis, time)``: ``Q`` [urad], ``N`` [deg/sqrt(h)], ``B`` [deg/h], ``K`` [deg/h^1.5],
+        ``R`` [deg/h^2], ``*_stderr``, ``*_upper`` (95 % upper limit where the term is not observed),
+        ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``; ``observable(axis, time, term)``: 0 the window
+        cannot see the term, 1 it gives an upper limit only, 2 the term is there (99 % one-sided). ``edf`` is that of the
+        fitted noise.
+
+    Raises
+    ------
+    OptionError
+        When a term or the method is unknown.
+    SchemaError
+        When `surface` is not a surface.
+
+    References
+    ----------
+    IEEE Std 952-1997, annex C. P15: Wang et al., Measurement 75 (2015) 263, Eq. 3.
+
+    Examples
+    --------
+    >>> from gyrostab.log import make_log
+    >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)  # 6 deg/h at 100 Hz: N = 0.6 / 60 deg/sqrt(h)
+    >>> from gyrostab.davar import davar
+    >>> product = fit_noise(davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min"))
+    >>> round(float(product.N.mean()), 4)
+    0.01
+    """
+    check_surface(surface)
+    wanted = list(terms)
+    unknown = [term for term in wanted if term not in TERMS]
+    if unknown or not wanted:
+        raise OptionError(f"terms {unknown or wanted}: choose among {', '.join(TERMS)}")
+    if method not in ("gls", "adev"):
+        raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
+    allowed = sum(1 << TERMS.index(term) for term in wanted)
+    return _fit_gls(surface, allowed) if method == "gls" else _fit_adev(surface, wanted)
+
+
+def _inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, int]:
+    """Cells as (axis, time, tau) arrays, averaging factors, rate and window length."""
+    try:
+        rate, window = float(surface.attrs["sampling_rate_hz"]), int(surface.attrs["window_samples"])
+    except KeyError as missing:
+        raise SchemaError(f"the surface lacks the attribute {missing}; it is not what gyrostab.davar writes") from missing
+    ks = np.round(np.asarray(surface["tau"].values) * rate).astype(np.int64)
+    names = ("avar", "white_response", "quantization_response", "gap_factor")
+    absent = [name for name in names if name not in surface]
+    if absent:
+        raise SchemaError(f"the surface lacks {absent}, which the fit needs to account for gaps; make it with gyrostab.davar")
+    return [surface[name].data for name in names], ks, rate, window
+
+
+def _fit_gls(surface: xr.Dataset, allowed: int) -> xr.Dataset:
+    cells, ks, rate, window = _inputs(surface)
+    chosen = _choose(ks)
+    shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
+    tables = _Tables(ks[chosen], shifts, rate, window)
+    n_axis, n_time, n_tau = (surface.sizes[dim] for dim in ("axis", "time", "tau"))
+
+    def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
+        flat = [np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64) for a in arrays]
+        return _fit_block(flat, tables, allowed).reshape(arrays[0].shape[0], arrays[0].shape[1], -1)
+
+    width = len(TERMS) * 4 + 2 + chosen.size
+    if isinstance(cells[0], da.Array):
+        whole = [cell.rechunk({2: -1}) for cell in cells]
+        fitted = da.map_blocks(block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64)
+    else:
+        fitted = block(*cells)
+    parts = [fitted[..., i] for i in range(width)]
+    n = len(TERMS)
+    out = _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)))
+    out["fit_chi2"] = (("axis", "time"), parts[4 * n], attributes("fit_chi2"))
+    out["fit_dof"] = (("axis", "time"), parts[4 * n + 1], attributes("fit_dof"))
+    if chosen.size == n_tau:  # otherwise davar's own, for every averaging time, stands
+        out["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
+    out.attrs["fit_method"] = "gls"
+    return out
+
+
+class _Tables:
+    """What every window of a surface shares; made once."""
+
+    def __init__(self, ks: NDArray[np.int64], shifts: NDArray[np.int64], rate: float, window: int):
+        self.columns = avar_columns(ks / rate)
+        self.to_samples = sample_squares(rate)
+        self.pairs = pair_products(window, ks, shifts)
+        self.ramps = ramp_products(window, ks, shifts)
+        terms = window - 2 * ks + 1
+        self.weight = np.array([n**2 / white_pair_sum(int(n), int(k)) for n, k in zip(terms, ks, strict=True)])
+
+
+def _choose(ks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Positions of the averaging factors to fit: all, or `MOST_TAUS` of them in even log spacing."""
+    if ks.size <= MOST_TAUS:
+        return np.arange(ks.size)
+    wanted = np.geomspace(ks[0], ks[-1], MOST_TAUS)
+    return np.unique(np.abs(np.log(ks)[:, None] - np.log(wanted)[None, :]).argmin(axis=0))
+
+
+def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -> NDArray[np.float64]:
+    """Coefficients, errors, limits, observability (n_terms each), chi2, dof and edf of each window, side by side."""
+    result, misfit, dof = fit_windows(
+        *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed
+    )
+    field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
+    square, error = field["square"], field["square_stderr"]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        value = np.sqrt(square)
+        # d(sqrt s) = ds / (2 sqrt s); near zero the root itself of the error of the square is the scale
+        stderr = np.where(square > error, error / (2.0 * value), np.sqrt(np.maximum(error, 0.0)) / np.where(square > error, 1.0, 2.0))
+        visible = np.isfinite(square) & (field["separation"] > _SEPARATION)
+        observed = visible & (square > 0) & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
+        upper = np.where(visible & ~observed, np.sqrt(_upper_limit(field)), np.nan)
+    stderr = np.where(visible, stderr, np.nan)
+    value = np.where(visible, value, np.nan)
+    observable = np.where(observed, 2.0, np.where(visible & np.isfinite(upper), 1.0, 0.0))
+    return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
+
+
+def _upper_limit(field: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """95 % upper limit of a squared coefficient.
+
+    The estimate free of sign has the variance ``a + b s + c s^2`` when the truth is s. The part in ``s^2`` is the
+    term's own, a chi-square with ``2 / c`` degrees of freedom, whose lower 5 % point is ``q s``; the rest is taken as
+    normal. The limit is the s at which the estimate lies that far below: ``(s - e)^2 = (1 - q)^2 s^2 + z^2 (a + b s)``.
+    """
+    estimate = np.maximum(field["free"], 0.0)
+    a, b, c = (np.maximum(field[name], 0.0) for name in ("variance_null", "variance_linear", "variance_square"))
+    freedom = 2.0 / np.maximum(c, 1e-12)
+    lower = gammaincinv(freedom / 2.0, 0.05) * 2.0 / freedom
+    curve = 1.0 - (1.0 - lower) ** 2
+    half = estimate + 0.5 * _LIMIT**2 * b
+    return np.asarray((half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT**2 * a), 0.0))) / curve)
+
+
+def _assemble(surface: xr.Dataset, values: list[Any], errors: list[Any], limits: list[Any], observable: list[Any]) -> xr.Dataset:
+    plane = ("axis", "time")
+    out = surface.copy()
+    for symbol, value, error, limit in zip(TERMS, values, errors, limits, strict=True):
+        out[symbol] = (plane, value, attributes(symbol))
+        out[f"{symbol}_stderr"] = (plane, error, attributes(f"{symbol}_stderr"))
+        out[f"{symbol}_upper"] = (plane, limit, attributes(f"{symbol}_upper"))
+        if f"{symbol}_squared" in _SQUARED:
+            out[f"{symbol}_squared"] = (plane, value**2, attributes(f"{symbol}_squared"))
+    stack = da.stack if isinstance(observable[0], da.Array) else np.stack
+    out["observable"] = ((*plane, "term"), stack(observable, axis=-1).astype(np.int8), attributes("observable"))
+    return out.assign_coords(term=("term", list(TERMS), attributes("term")))
+
+
+_SQUARED = ("N_squared", "K_squared")
+
+
+def _fit_adev(surface: xr.Dataset, wanted: list[str]) -> xr.Dataset:
+    """P15 Eq. 3-4: least squares of the Allan deviation in half-integer powers of tau, each window on its own."""
+    deviation = np.sqrt(np.asarray(surface["avar"].data, dtype=np.float64))
+    members = [TERMS.index(term) for term in wanted]
+    columns = np.sqrt(avar_columns(surface["tau"].values))[:, members]
+    scale = np.linalg.norm(columns, axis=0)
+    values = np.full((*deviation.shape[:2], len(TERMS)), np.nan)
+    for where in np.ndindex(deviation.shape[:2]):
+        here = np.isfinite(deviation[where])
+        if np.count_nonzero(here) >= len(members):
+            solution = np.linalg.lstsq(columns[here] / scale, deviation[where][here], rcond=None)[0]
+            values[where][members] = np.abs(solution / scale)
+    nothing = [np.full(deviation.shape[:2], np.nan) for _ in LAWS]
+    seen = [np.where(np.isfinite(values[..., i]), 2, 0) for i in range(len(TERMS))]
+    out = _assemble(surface, [values[..., i] for i in range(len(TERMS))], nothing, nothing, seen)
+    out["fit_chi2"] = (("axis", "time"), nothing[0], attributes("fit_chi2"))
+    out["fit_dof"] = (("axis", "time"), nothing[0], attributes("fit_dof"))
+    out.attrs["fit_method"] = "adev"
+    return out

@@ -1,0 +1,448 @@
+"""Generalised non-negative least squares of Allan variances, one small problem per window.
+
+The Allan variance is linear in the squared coefficients, so a window is ``y = X s + e`` with ``s >= 0``. Overlapping
+estimates at neighbouring averaging factors share data; the covariance of e follows from the noise itself
+(`gyrostab.kernels.covariance`), so it is taken from the fit and iterated. The non-negative solution is exact: the at
+most 31 subsets of five terms are tried.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = ["FIT_FIELDS", "degrees_of_freedom", "fit_window", "fit_windows", "identify_noise", "solve_nonnegative"]
+
+#: Rows of the per-term result of `fit_windows`.
+FIT_FIELDS = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square", "separation")
+
+
+@njit(nogil=True, cache=True)
+def _cholesky(matrix, n):  # type: ignore[no-untyped-def]
+    """Lower factor in place of the leading n x n block; False when it is not positive definite."""
+    for j in range(n):
+        for i in range(j, n):
+            total = matrix[i, j]
+            for p in range(j):
+                total -= matrix[i, p] * matrix[j, p]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                matrix[j, j] = np.sqrt(total)
+            else:
+                matrix[i, j] = total / matrix[j, j]
+    return True
+
+
+@njit(nogil=True, cache=True)
+def _forward(factor, n, vector):  # type: ignore[no-untyped-def]
+    """Solve ``factor x = vector`` in place."""
+    for i in range(n):
+        total = vector[i]
+        for p in range(i):
+            total -= factor[i, p] * vector[p]
+        vector[i] = total / factor[i, i]
+
+
+@njit(nogil=True, cache=True)
+def _backward(factor, n, vector):  # type: ignore[no-untyped-def]
+    """Solve ``factor^T x = vector`` in place."""
+    for i in range(n - 1, -1, -1):
+        total = vector[i]
+        for p in range(i + 1, n):
+            total -= factor[p, i] * vector[p]
+        vector[i] = total / factor[i, i]
+
+
+@njit(nogil=True, cache=True)
+def _solve_subset(normal, right, subset, solution):  # type: ignore[no-untyped-def]
+    """Solve the normal equations for the terms in the bit set `subset`; False when they cannot be told apart."""
+    members = np.empty(right.size, np.int64)
+    n = 0
+    for a in range(right.size):
+        if subset >> a & 1:
+            members[n] = a
+            n += 1
+    factor = np.empty((n, n))
+    vector = np.empty(n)
+    for i in range(n):
+        vector[i] = right[members[i]]
+        for j in range(n):
+            factor[i, j] = normal[members[i], members[j]]
+        factor[i, i] *= 1.0 + 1e-12
+    if not _cholesky(factor, n):
+        return False
+    _forward(factor, n, vector)
+    _backward(factor, n, vector)
+    solution[:] = 0.0
+    for i in range(n):
+        solution[members[i]] = vector[i]
+    return True
+
+
+@njit(nogil=True, cache=True)
+def solve_nonnegative(normal, right, allowed, solution):  # type: ignore[no-untyped-def]
+    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``; returns the bit set of the terms above zero.
+
+    Parameters
+    ----------
+    normal : float64 (n, n); right : float64 (n,)
+        Normal equations.
+    allowed : int
+        Bit set of the terms that may be used.
+    solution : float64 (n,)
+        Overwritten with the minimiser.
+    """
+    n = right.size
+    scale = np.empty(n)
+    scaled = np.empty((n, n))
+    scaled_right = np.empty(n)
+    for i in range(n):
+        scale[i] = 1.0 / np.sqrt(normal[i, i]) if normal[i, i] > 0.0 else 0.0
+    for i in range(n):
+        scaled_right[i] = right[i] * scale[i]
+        for j in range(n):
+            scaled[i, j] = normal[i, j] * scale[i] * scale[j]
+    best = 0.0
+    chosen = 0
+    trial = np.empty(n)
+    solution[:] = 0.0
+    for subset in range(1, 1 << n):
+        if subset & ~allowed or not _solve_subset(scaled, scaled_right, subset, trial):
+            continue
+        gain = 0.0
+        feasible = True
+        for i in range(n):
+            feasible = feasible and trial[i] >= 0.0
+            gain += trial[i] * scaled_right[i]
+        if feasible and gain > best:
+            best = gain
+            chosen = subset
+            for i in range(n):
+                solution[i] = trial[i] * scale[i]
+    return chosen
+
+
+@njit(nogil=True, cache=True)
+def _take(values, index, n):  # type: ignore[no-untyped-def]
+    """``values[index[:n]]``, which numba compiles ten times slower."""
+    out = np.empty(n)
+    for i in range(n):
+        out[i] = values[index[i]]
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _columns(columns, white, quantization, index, n):  # type: ignore[no-untyped-def]
+    """Design matrix of the valid cells, with the responses to white and quantization noise seen through the gaps."""
+    design = np.empty((n, columns.shape[1]))
+    for i in range(n):
+        for a in range(columns.shape[1]):
+            response = quantization[index[i]] if a == 0 else (white[index[i]] if a == 1 else 1.0)
+            design[i, a] = columns[index[i], a] * response
+    return design
+
+
+@njit(nogil=True, cache=True)
+def _covariance(squares, to_samples, white, quantization, factor, pairs, ramps, index, n, out):  # type: ignore[no-untyped-def]
+    """Covariance of the valid cells for squared coefficients `squares`; `out` (n, n) is overwritten."""
+    root = np.empty((4, n))
+    for i in range(n):
+        cell = index[i]
+        for a in range(4):
+            response = quantization[cell] if a == 0 else (white[cell] if a == 1 else 1.0)
+            root[a, i] = np.sqrt(max(squares[a], 0.0) * to_samples[a] * response)
+    ramp = max(squares[4], 0.0) * to_samples[4]
+    for i in range(n):
+        for j in range(i + 1):
+            p, q = index[i], index[j]
+            total = 0.0
+            for a in range(4):
+                amplitude = root[a, i] * root[a, j]
+                if amplitude == 0.0:
+                    continue
+                total += ramp * amplitude * ramps[a, p, q]
+                for b in range(4):
+                    total += amplitude * root[b, i] * root[b, j] * pairs[a, b, p, q]
+            total /= np.sqrt(factor[p] * factor[q])
+            out[i, j] = total
+            out[j, i] = total
+
+
+@njit(nogil=True, cache=True)
+def _quick(y, weight, factor, index, design, allowed, squares):  # type: ignore[no-untyped-def]
+    """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise."""
+    terms = design.shape[1]
+    normal = np.zeros((terms, terms))
+    right = np.zeros(terms)
+    for i in range(y.size):
+        w = weight[index[i]] * factor[index[i]] / (y[i] * y[i])
+        for a in range(terms):
+            right[a] += w * design[i, a] * y[i]
+            for b in range(terms):
+                normal[a, b] += w * design[i, a] * design[i, b]
+    return solve_nonnegative(normal, right, allowed, squares)
+
+
+@njit(nogil=True, cache=True)
+def _valid(avar, factor, index):  # type: ignore[no-untyped-def]
+    n = 0
+    for i in range(avar.size):
+        if np.isfinite(avar[i]) and avar[i] > 0.0 and factor[i] > 0.0:
+            index[n] = i
+            n += 1
+    return n
+
+
+@njit(nogil=True, cache=True)
+def degrees_of_freedom(squares, to_samples, columns, white, quantization, factor, pairs, ramps):  # type: ignore[no-untyped-def]
+    """Equivalent degrees of freedom of each cell under a mixture of noises, ``2 mean^2 / variance``.
+
+    Parameters
+    ----------
+    squares : float64 (5,)
+        Squared coefficients.
+    to_samples : float64 (5,)
+        Squared coefficient to sample units (rate per sample, interval 1).
+    columns : float64 (n_tau, 5)
+        Allan variance per squared coefficient.
+    white, quantization, factor : float64 (n_tau,)
+        Responses seen through the gaps, and degrees of freedom left as a share.
+    pairs : float64 (4, 4, n_tau); ramps : float64 (4, n_tau)
+        Diagonals of `pair_products` and `ramp_products`.
+    """
+    n_tau = columns.shape[0]
+    out = np.zeros(n_tau)
+    for i in range(n_tau):
+        mean = 0.0
+        variance = 0.0
+        for a in range(5):
+            response = quantization[i] if a == 0 else (white[i] if a == 1 else 1.0)
+            share = squares[a] * response
+            mean += share * columns[i, a]
+            if a == 4:
+                continue
+            variance += share * to_samples[a] * squares[4] * to_samples[4] * ramps[a, i]
+            for b in range(4):
+                other = quantization[i] if b == 0 else (white[i] if b == 1 else 1.0)
+                variance += share * to_samples[a] * squares[b] * other * to_samples[b] * pairs[a, b, i]
+        if variance > 0.0:
+            out[i] = 2.0 * mean * mean / variance * factor[i]
+    return out
+
+
+@njit(nogil=True, cache=True)
+def identify_noise(avar, white, quantization, factor, columns, weight, to_samples, pairs, ramps):  # type: ignore[no-untyped-def]
+    """Degrees of freedom of each cell with the noise mixture identified by a quick fit of the window.
+
+    Parameters
+    ----------
+    avar, white, quantization, factor : float64 (n_windows, n_tau)
+        Cells and what the gaps do to them.
+    columns, to_samples, pairs, ramps
+        As in `degrees_of_freedom`.
+    weight : float64 (n_tau,)
+        Degrees of freedom for white noise, the weights of the quick fit.
+
+    Returns
+    -------
+    float64 (n_windows, n_tau)
+    """
+    out = np.full(avar.shape, np.nan)
+    squares = np.empty(5)
+    index = np.empty(avar.shape[1], np.int64)
+    for w in range(avar.shape[0]):
+        n = _valid(avar[w], factor[w], index)
+        if n == 0:
+            continue
+        design = _columns(columns, white[w], quantization[w], index, n)
+        _quick(_take(avar[w], index, n), weight, factor[w], index, design, 31, squares)
+        dof = degrees_of_freedom(squares, to_samples, columns, white[w], quantization[w], factor[w], pairs, ramps)
+        for i in range(n):
+            out[w, index[i]] = dof[index[i]]
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _normal_equations(y, design, factor, n):  # type: ignore[no-untyped-def]
+    """Whiten with the Cholesky factor of the covariance: normal matrix, right-hand side and whitened data."""
+    terms = design.shape[1]
+    whitened = np.empty((terms, n))
+    data = y.copy()
+    _forward(factor, n, data)
+    for a in range(terms):
+        for i in range(n):
+            whitened[a, i] = design[i, a]
+        _forward(factor, n, whitened[a])
+    normal = np.empty((terms, terms))
+    right = np.empty(terms)
+    for a in range(terms):
+        right[a] = 0.0
+        for i in range(n):
+            right[a] += whitened[a, i] * data[i]
+        for b in range(terms):
+            normal[a, b] = 0.0
+            for i in range(n):
+                normal[a, b] += whitened[a, i] * whitened[b, i]
+    return normal, right, whitened, data
+
+
+@njit(nogil=True, cache=True)
+def _term(a, chosen, normal, right, whitened, factor, squares, spread, result):  # type: ignore[no-untyped-def]
+    """Estimate of one term, free of sign beside the chosen ones, and how its variance grows with the term itself."""
+    terms, n = whitened.shape
+    subset = chosen | 1 << a
+    unit = np.zeros(terms)
+    unit[a] = 1.0
+    scale = np.empty(terms)
+    for b in range(terms):
+        scale[b] = 1.0 / np.sqrt(normal[b, b]) if normal[b, b] > 0.0 else 0.0
+    scaled = np.empty((terms, terms))
+    for b in range(terms):
+        unit[b] *= scale[b]
+        for c in range(terms):
+            scaled[b, c] = normal[b, c] * scale[b] * scale[c]
+    row = np.empty(terms)
+    if not _solve_subset(scaled, unit, subset, row):
+        result[6, a] = 0.0
+        return
+    result[0, a] = squares[a]
+    result[2, a] = 0.0
+    weights = np.zeros(n)
+    for b in range(terms):
+        row[b] *= scale[b]  # row a of the inverse normal matrix: the estimator is the sum of row[b] right[b]
+        result[2, a] += row[b] * right[b]
+        for i in range(n):
+            weights[i] += row[b] * whitened[b, i]
+    result[1, a] = np.sqrt(max(row[a], 0.0))
+    _backward(factor, n, weights)  # estimator as weights on the cells
+    for p in range(3):  # spread[0]: covariance without the term; [1]: growth with it; [2]: its own square
+        total = 0.0
+        for i in range(n):
+            for j in range(n):
+                total += weights[i] * weights[j] * spread[p, i, j]
+        result[3 + p, a] = total
+    everything = (1 << terms) - 1
+    if _solve_subset(scaled, unit, everything, row):
+        result[6, a] = 1.0 / max(row[a] * scale[a] * normal[a, a], 1.0)
+    else:
+        result[6, a] = 0.0
+
+
+@njit(nogil=True, cache=True)
+def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, ramps, weight, allowed, result):  # type: ignore[no-untyped-def]
+    """Fit one window; returns chi-square, degrees of freedom and the number of usable cells (arguments as `fit_windows`)."""
+    index = np.empty(y.size, np.int64)
+    n = _valid(y, gap_factor, index)
+    terms = columns.shape[1]
+    result[:] = np.nan
+    if n == 0:
+        return np.nan, 0, 0
+    data = _take(y, index, n)
+    design = _columns(columns, white, quantization, index, n)
+    squares = np.zeros(terms)
+    chosen = _quick(data, weight, gap_factor, index, design, allowed, squares)
+    factor = np.empty((n, n))
+    normal = np.zeros((terms, terms))
+    right = np.zeros(terms)
+    whitened = np.zeros((terms, n))
+    rest = data
+    for _ in range(6):
+        previous = squares.copy()
+        _covariance(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, factor)
+        for i in range(n):
+            factor[i, i] += 1e-16 * data[i] * data[i] + 1e-10 * factor[i, i]  # a window without noise stays solvable
+        if not _cholesky(factor, n):
+            return np.nan, 0, n
+        normal, right, whitened, rest = _normal_equations(data, design, factor, n)
+        chosen = solve_nonnegative(normal, right, allowed, squares)
+        moved = False
+        for a in range(terms):
+            moved = moved or abs(squares[a] - previous[a]) > 1e-4 * previous[a]
+        if not moved:
+            break
+    used = 0
+    spread = np.empty((3, n, n))
+    trial = np.empty(terms)
+    for a in range(terms):
+        if not allowed >> a & 1:
+            continue
+        used += chosen >> a & 1
+        trial[:] = squares
+        trial[a] = 0.0
+        _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[0])
+        trial[:] = 0.0
+        trial[a] = 1.0
+        _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[2])
+        trial[:] = squares
+        trial[a] = 1.0
+        _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[1])
+        for i in range(n):
+            for j in range(n):
+                spread[1, i, j] -= spread[0, i, j] + spread[2, i, j]
+        _term(a, chosen, normal, right, whitened, factor, squares, spread, result)
+    chi2 = 0.0
+    for i in range(n):
+        misfit = rest[i]
+        for a in range(terms):
+            misfit -= squares[a] * whitened[a, i]
+        chi2 += misfit * misfit
+    return chi2, n - used, n
+
+
+@njit(nogil=True, cache=True)
+def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pairs, ramps, weight, allowed):  # type: ignore[no-untyped-def]
+    """Fit every window.
+
+    Parameters
+    ----------
+    avar, white, quantization, gap_factor : float64 (n_windows, n_tau)
+        Cells [degree2 hour-2], NaN where there is none, and what the gaps do to them.
+    columns : float64 (n_tau, 5)
+        Allan variance per squared coefficient.
+    to_samples : float64 (5,)
+        Squared coefficient to sample units.
+    pairs : float64 (4, 4, n_tau, n_tau); ramps : float64 (4, n_tau, n_tau)
+        `pair_products` and `ramp_products`.
+    weight : float64 (n_tau,)
+        Degrees of freedom for white noise, the weights of the first pass.
+    allowed : int
+        Bit set of the terms to fit.
+
+    Returns
+    -------
+    result : float64 (n_windows, 7, 5)
+        Rows as `FIT_FIELDS`: squared coefficient; its standard error; its estimate free of sign; variance of that
+        estimate without the term, growth per unit of the square, per unit of its square; separation, the share of the
+        column that the other terms cannot imitate.
+    misfit : float64 (n_windows, 2)
+        Chi-square and degrees of freedom.
+    dof : float64 (n_windows, n_tau)
+        Equivalent degrees of freedom of the cells under the fitted noise.
+    """
+    n_windows, n_tau = avar.shape
+    result = np.empty((n_windows, len(FIT_FIELDS), columns.shape[1]))
+    misfit = np.empty((n_windows, 2))
+    dof = np.full((n_windows, n_tau), np.nan)
+    diagonal = np.empty((4, 4, n_tau))
+    ramp_diagonal = np.empty((4, n_tau))
+    for i in range(n_tau):
+        for a in range(4):
+            ramp_diagonal[a, i] = ramps[a, i, i]
+            for b in range(4):
+                diagonal[a, b, i] = pairs[a, b, i, i]
+    squares = np.empty(columns.shape[1])
+    for w in range(n_windows):
+        chi2, freedom, n = fit_window(
+            avar[w], white[w], quantization[w], gap_factor[w], columns, to_samples, pairs, ramps, weight, allowed, result[w]
+        )
+        misfit[w, 0], misfit[w, 1] = chi2, freedom
+        if n == 0 or not np.isfinite(chi2):
+            continue
+        for a in range(columns.shape[1]):
+            squares[a] = result[w, 0, a] if np.isfinite(result[w, 0, a]) else 0.0
+        cells = degrees_of_freedom(squares, to_samples, columns, white[w], quantization[w], gap_factor[w], diagonal, ramp_diagonal)
+        for i in range(n_tau):
+            if np.isfinite(avar[w, i]):
+                dof[w, i] = cells[i]
+    return result, misfit, dof

@@ -1,0 +1,79 @@
+"""Sums over pairs of second differences: how many independent ones an overlapping Allan variance is worth.
+
+For Gaussian second differences with autocorrelation ``rho(l)`` a mean of n squares has ``n^2 / v(n)`` equivalent degrees
+of freedom, ``v(n) = sum_ij rho(i - j)^2`` (Greenhall and Riley, PTTI 2003). For angle random walk rho is piecewise linear
+and the sum has a closed form; runs between gaps of a rate log share no samples and so simply add their v.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = ["strict_gap_factors", "white_pair_sum"]
+
+
+@njit(nogil=True, cache=True)
+def _moment(n, slope, a, b):  # type: ignore[no-untyped-def]
+    """``sum((n - l) (1 - slope l)^2 for l in a..b)`` in closed form."""
+    if b < a:
+        return 0.0
+    x, y = float(b), float(a - 1)
+    s0 = x - y
+    s1 = (x * (x + 1) - y * (y + 1)) / 2
+    s2 = (x * (x + 1) * (2 * x + 1) - y * (y + 1) * (2 * y + 1)) / 6
+    s3 = ((x * (x + 1)) ** 2 - (y * (y + 1)) ** 2) / 4
+    return n * s0 - (1 + 2 * slope * n) * s1 + (2 * slope + slope**2 * n) * s2 - slope**2 * s3
+
+
+@njit(nogil=True, cache=True)
+def white_pair_sum(n, k):  # type: ignore[no-untyped-def]
+    """``sum_ij rho(i - j)^2`` over n consecutive second differences of averaging factor k, for angle random walk."""
+    if n < 1:
+        return 0.0
+    near = _moment(float(n), 1.5 / k, 1, min(n - 1, k))
+    far = _moment(float(n), 0.5 / k, k + 1, min(n - 1, 2 * k - 1))
+    return n + 2.0 * (near + far)
+
+
+@njit(nogil=True, cache=True)
+def strict_gap_factors(begin, end, counts, full, k, shift, window, step):  # type: ignore[no-untyped-def]
+    """Degrees of freedom of each window with gaps, as a share of the gap-free window's.
+
+    Parameters
+    ----------
+    begin, end : int64 (n_intervals,)
+        Valid intervals of m of a rate log.
+    counts, full : int64 (n_windows,)
+        Terms used and terms without gaps.
+    k, shift, window, step : int
+        Averaging factor, thinning of the terms (every ``2**shift``-th), window and step in samples.
+
+    Returns
+    -------
+    float64 (n_windows,)
+        1 where nothing is missing, 0 where nothing is left.
+    """
+    length = window - 2 * k + 1
+    up = (1 << shift) - 1
+    out = np.ones(counts.size)
+    v = 0
+    for j in range(counts.size):
+        first = j * step
+        while v < begin.size and end[v] <= first:
+            v += 1
+        if counts[j] == full[j]:
+            continue
+        if counts[j] == 0:
+            out[j] = 0.0
+            continue
+        pairs = 0.0
+        for u in range(v, begin.size):
+            if begin[u] >= first + length:
+                break
+            a = (max(begin[u], first) + up) >> shift
+            b = (min(end[u], first + length) + up) >> shift
+            pairs += white_pair_sum(b - a, k >> shift)
+        ratio = counts[j] / full[j]
+        out[j] = ratio * ratio * white_pair_sum(full[j], k >> shift) / pairs
+    return out

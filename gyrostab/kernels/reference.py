@@ -1,0 +1,113 @@
+"""The published algorithms as printed: classical DAVAR and the recursive fast DAVAR, for comparison and for tests.
+
+Both take every window's second differences of the angle ``theta``. With the paper's convention theta has one point per
+sample and a window of W samples has ``W - 2k`` terms; otherwise W rate samples have W + 1 angles and ``W - 2k + 1`` terms,
+as in allantools and in the R package wv.
+
+References
+----------
+Wang et al., Sensors 16 (2016): Eq. 16-17 (classical), 19-20 (recursion), 21-22 (missing data). Their Eq. 5 and 12 divide
+differences of averages by ``k^2 tau0^2`` once more; Eq. 16-17, in the angle, are right.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["direct_sums", "recursive_sums", "reference_theta"]
+
+
+def reference_theta(
+    x: NDArray[np.generic], *, angle: bool, paper: bool
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64]]:
+    """Angle of a whole record, which angles are present, and how many samples are missing before each.
+
+    Parameters
+    ----------
+    x : ndarray (n,)
+        Rates or cumulative angles, NaN where missing.
+    angle : bool
+        The samples are angles.
+    paper : bool
+        One angle per sample (the sum up to and with it) instead of n + 1.
+
+    Returns
+    -------
+    theta : float64 (n or n + 1,)
+        The integral of the rate in sample units; missing rates add nothing.
+    present : bool (n or n + 1,)
+        Whether the angle is given (angles), or the sample that ends there (rates).
+    missing : int64 (n or n + 1,)
+        Missing rate samples before the angle; zeros for angles.
+    """
+    values = np.asarray(x, dtype=np.float64)
+    here = np.isfinite(values)
+    if angle:
+        return np.where(here, values, 0.0), here, np.zeros(values.size, dtype=np.int64)
+    theta = np.cumsum(np.where(here, values, 0.0))
+    missing = np.cumsum(~here)
+    if paper:
+        return theta, here, missing
+    return np.concatenate(([0.0], theta)), np.concatenate(([True], here)), np.concatenate(([0], missing))
+
+
+def direct_sums(
+    theta: NDArray[np.float64],
+    present: NDArray[np.bool_],
+    missing: NDArray[np.int64],
+    window_points: int,
+    step: int,
+    n_windows: int,
+    ks: NDArray[np.int64],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Classical DAVAR (Eq. 16): every window from the beginning. Returns sums and counts, shape (n_windows, n_tau)."""
+    sums = np.zeros((n_windows, ks.size))
+    counts = np.zeros((n_windows, ks.size), dtype=np.int64)
+    for j in range(n_windows):
+        part = slice(j * step, j * step + window_points)
+        angle, here, lost = theta[part] - theta[j * step], present[part], missing[part]
+        for i, k in enumerate(ks):
+            d = angle[2 * k :] - 2.0 * angle[k:-k] + angle[: -2 * k]
+            valid = here[2 * k :] & here[k:-k] & here[: -2 * k] & (lost[2 * k :] == lost[: -2 * k])
+            sums[j, i] = np.sum(d[valid] ** 2)
+            counts[j, i] = np.count_nonzero(valid)
+    return sums, counts
+
+
+@njit(nogil=True, cache=True)
+def _difference(theta, present, missing, m, k):  # type: ignore[no-untyped-def]
+    """Second difference at m, zero where a point is missing (Eq. 21-22), and whether it is there."""
+    if present[m] and present[m + k] and present[m + 2 * k] and missing[m] == missing[m + 2 * k]:
+        return theta[m + 2 * k] - 2.0 * theta[m + k] + theta[m], 1
+    return 0.0, 0
+
+
+@njit(nogil=True, cache=True)
+def recursive_sums(theta, present, missing, window_points, step, n_windows, ks):  # type: ignore[no-untyped-def]
+    """Fast DAVAR (Eq. 19): sample by sample, the newest squared difference in, the oldest out.
+
+    Parameters are those of `direct_sums`; so is the result. The differences of nearly equal sums lose digits after a
+    shock (1 part in 1 after 10^6 sigma), which is why this is a reference and not the default.
+    """
+    sums = np.zeros((n_windows, ks.size))
+    counts = np.zeros((n_windows, ks.size), np.int64)
+    for i in range(ks.size):
+        k = ks[i]
+        length = window_points - 2 * k
+        total = 0.0
+        count = 0
+        for m in range(length):  # the starting value, Eq. 20
+            d, here = _difference(theta, present, missing, m, k)
+            total += d * d
+            count += here
+        sums[0, i], counts[0, i] = total, count
+        for n in range((n_windows - 1) * step):
+            new, new_here = _difference(theta, present, missing, n + length, k)
+            old, old_here = _difference(theta, present, missing, n, k)
+            total += new * new - old * old
+            count += new_here - old_here
+            if (n + 1) % step == 0:
+                sums[(n + 1) // step, i], counts[(n + 1) // step, i] = total, count
+    return sums, counts

@@ -1,0 +1,91 @@
+"""A log from an array: the way in for data that is already in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyrostab.errors import OptionError
+from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.timegrid import time_coordinate
+from gyrostab.units import INNER, parse_unit
+
+__all__ = ["make_log"]
+
+
+def make_log(
+    values: Any,
+    *,
+    rate: float,
+    unit: str,
+    start: str = "1970-01-01T00:00:00",
+    axis: Sequence[str] | None = None,
+    kind: str = "rate",
+    channels: Mapping[str, tuple[Any, str]] | None = None,
+) -> xr.Dataset:
+    """Make a regular log of uniformly sampled values.
+
+    Parameters
+    ----------
+    values : array_like, shape (time,) or (axis, time)
+        Rotation rate or cumulative angle; NaN marks a missing sample. numpy or dask, float or integer.
+    rate : float
+        Sampling rate [Hz].
+    unit : str
+        Unit of the values, for instance ``"deg/s"`` or ``"0.1 arcsec/s"``.
+    start : str
+        Time of the first sample, ISO 8601, UTC.
+    axis : sequence of str, optional
+        Names of the axes; x, y, z by default.
+    kind : {"rate", "angle"}
+        Whether the values are rates or cumulative angles.
+    channels : mapping, optional
+        Name to (values on the same time, unit), for instance ``{"temperature": (t, "degC")}``.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], and the channels.
+
+    Raises
+    ------
+    OptionError
+        When shape, rate or kind make no sense.
+    UnitError
+        When the unit is unknown or does not fit `kind`.
+
+    Examples
+    --------
+    >>> log = make_log(np.zeros((3, 1000)), rate=100.0, unit="deg/s", start="2026-01-01")
+    >>> log.rate.dims, log.rate.units
+    (('axis', 'time'), 'degree hour-1')
+    """
+    if kind not in SIGNAL_UNITS:
+        raise OptionError(f"kind={kind!r}: give 'rate' or 'angle'")
+    if not (np.isfinite(rate) and rate > 0):
+        raise OptionError(f"rate={rate!r}: give the sampling rate in Hz, a number above 0")
+    parsed = parse_unit(unit)
+    if parsed.quantity != kind:
+        raise OptionError(f"unit {unit!r} is a unit of {parsed.quantity}, but kind is {kind!r}")
+    data = values if hasattr(values, "ndim") else np.asarray(values)
+    data = data[None, :] if data.ndim == 1 else data
+    names = list(axis) if axis is not None else list("xyz")[: data.shape[0]]
+    if data.ndim != 2 or len(names) != data.shape[0]:
+        raise OptionError(f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, time) and one name per axis")
+    if parsed.factor != 1.0:
+        data = data * parsed.factor
+    coordinates = time_coordinate(int(pd.Timestamp(start).as_unit("ns").value), rate, data.shape[1])
+    log = xr.Dataset(
+        {kind: (("axis", "time"), data, {"units": SIGNAL_UNITS[kind], "long_name": "rotation rate" if kind == "rate" else "angle"})},
+        coords=coordinates,
+        attrs={"sampling_rate_hz": float(rate), "kind": kind},
+    ).assign_coords(axis=names)
+    for name, (channel, text) in (channels or {}).items():
+        unit_of = parse_unit(text)
+        converted = np.asarray(channel) * unit_of.factor + unit_of.offset
+        log[name] = (("time",), converted, {"units": INNER[unit_of.quantity]})
+    return log

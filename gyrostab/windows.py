@@ -1,0 +1,142 @@
+"""Windows, steps and averaging times as users give them, to whole numbers of samples."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+
+__all__ = ["averaging_factors", "duration_seconds", "samples", "thin"]
+
+_SAMPLES = re.compile(r"^\s*(\d+)\s*samples?\s*$")
+
+
+def duration_seconds(value: Any, option: str) -> float:
+    """Seconds of a duration: a number [s], a timedelta, or a string such as ``"10min"`` or ``"0.1s"``.
+
+    Raises
+    ------
+    OptionError
+        When it cannot be read or is not above zero.
+
+    Examples
+    --------
+    >>> duration_seconds("10min", "window")
+    600.0
+    """
+    try:
+        if isinstance(value, str):
+            seconds = pd.Timedelta(re.sub(r"(?<=[\d ])m$", "min", value.strip())).value / 1e9
+            if re.fullmatch(r"[\d.eE+-]+", value.strip()):
+                raise OptionError(f"{option} {value!r} has no unit; write for instance {value}s, {value}min or {value}samples")
+        elif isinstance(value, (int, float, np.number)):
+            seconds = float(value)
+        else:
+            seconds = pd.Timedelta(value).value / 1e9
+    except OptionError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise OptionError(f"{option} {value!r} is not a duration; write for instance 10min, 30s or 2000samples") from error
+    if not (np.isfinite(seconds) and seconds > 0):
+        raise OptionError(f"{option} {value!r} must be longer than zero")
+    return float(seconds)
+
+
+def samples(value: Any, rate: float, option: str) -> int:
+    """Whole samples of a length of time, or of a number of samples (an integer or ``"2000samples"``).
+
+    Examples
+    --------
+    >>> samples("10s", 400.0, "window"), samples("2000samples", 400.0, "window"), samples(30, 400.0, "step")
+    (4000, 2000, 30)
+    """
+    match = _SAMPLES.match(value) if isinstance(value, str) else None
+    if match or (isinstance(value, (int, np.integer)) and not isinstance(value, bool)):
+        count = int(match.group(1)) if match else int(value)
+        if count < 1:
+            raise OptionError(f"{option} of {count} samples: give at least 1")
+        return count
+    seconds = duration_seconds(value, option)
+    count = round(seconds * rate)
+    if count < 1:
+        raise OptionError(f"{option} {value!r} is shorter than one sample at {rate:g} Hz ({1 / rate:g} s)")
+    return count
+
+
+def averaging_factors(taus: Any, *, rate: float, window: int, tau_max: Any = None) -> NDArray[np.int64]:
+    """Averaging factors k, rising and distinct, of the averaging times ``k / rate`` asked for.
+
+    Parameters
+    ----------
+    taus : int, {"octave", "all"} or sequence
+        So many in even log spacing, powers of two, every one, or a list of durations [s].
+    rate : float
+        Sampling rate [Hz].
+    window : int
+        Window [samples].
+    tau_max : float or str, optional
+        Longest averaging time; a third of the window by default.
+
+    Raises
+    ------
+    OptionError
+        When an averaging time is longer than half of the window, or none is left.
+
+    Examples
+    --------
+    >>> averaging_factors("octave", rate=100.0, window=1000)
+    array([  1,   2,   4,   8,  16,  32,  64, 128, 256])
+    >>> averaging_factors(["0.1s", "1s"], rate=100.0, window=1000)
+    array([ 10, 100])
+    """
+    longest = window // 2
+    limit = window // 3
+    if tau_max is not None:
+        limit = int(duration_seconds(tau_max, "tau_max") * rate + 1e-6)
+        if limit > longest or limit < 1:
+            raise OptionError(
+                f"tau_max of {limit / rate:g} s does not fit the window of {window / rate:g} s; "
+                f"give {1 / rate:g} s to {longest / rate:g} s (half of the window)"
+            )
+    limit = max(1, limit)
+    if isinstance(taus, str):
+        text = taus.strip()
+        if text == "octave":
+            return np.asarray(2 ** np.arange(int(np.log2(limit)) + 1), dtype=np.int64)
+        if text == "all":
+            return np.arange(1, limit + 1, dtype=np.int64)
+        taus = int(text) if text.isdigit() else [part for part in text.split(",") if part.strip()]
+    if isinstance(taus, (int, np.integer)):
+        if taus < 1:
+            raise OptionError(f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' or a list such as 0.1s,1s")
+        return np.unique(np.round(np.geomspace(1, limit, int(taus))).astype(np.int64)) if limit > 1 else np.array([1], dtype=np.int64)
+    ks = []
+    for tau in taus:
+        k = round(duration_seconds(tau, "tau") * rate)
+        if k < 1:
+            raise OptionError(f"tau {tau!r} is shorter than one sample at {rate:g} Hz ({1 / rate:g} s)")
+        if k > longest:
+            raise OptionError(
+                f"tau {tau!r} is longer than half of the window ({longest / rate:g} s), so no second difference fits; "
+                "give a longer --window or shorter --taus"
+            )
+        ks.append(k)
+    if not ks:
+        raise OptionError("no averaging time is given; use for instance --taus 40, octave, all or 0.1s,1s,10s")
+    return np.unique(np.asarray(ks, dtype=np.int64))
+
+
+def thin(ks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Power of two that thins the second differences of each factor: the largest with ``k >= 8 * 2**shift``.
+
+    Examples
+    --------
+    >>> thin(np.array([1, 15, 16, 100, 40000]))
+    array([ 0,  0,  1,  3, 12])
+    """
+    return np.maximum(np.floor(np.log2(ks)).astype(np.int64) - 3, 0)
