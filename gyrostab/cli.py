@@ -239,7 +239,7 @@ def ingest(logs: Logs, /, *, output: Output, max_gap: str = "10D", reading: Read
     output
         File to write, LOG.nc or LOG.zarr.
     max_gap
-        Longest gap to bridge; a longer one is taken for a wrong clock.
+        Longest gap; a longer step of the time stamps is taken for a step of the clock.
     """
     from gyrostab.export import to_netcdf, to_zarr
     from gyrostab.run import check_output, load_log, samples_of

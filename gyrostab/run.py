@@ -71,7 +71,7 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
     paths : sequence of path
         Files, in any order; one NetCDF or Zarr log that gyrostab wrote is opened as it is, without loading it.
     max_gap : str
-        Longest gap that is filled with missing samples; longer ones are an error.
+        Longest gap; a longer step of the stamps is taken for a step of the clock.
     **reading
         Options of `gyrostab.read.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``.
 
@@ -169,6 +169,7 @@ def run(
     stage("computing", samples_of(log))
     surface = davar(log, **(windows or {}))
     to_netcdf(fit_noise(surface, **(fitting or {})), target, overwrite=overwrite)
+    stage("checking", 0)
     _note_constant(target)
     return target
 

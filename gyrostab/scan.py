@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,8 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     ...     path = Path(folder) / "tool.csv"
     ...     _ = path.write_text("time [s],gyro_x [deg/h]\n" + "".join(f"{n / 10},{n % 3}\n" for n in range(50)))
     ...     table = scan(path)
-    >>> table.loc[0, ["rate_hz", "axes", "rows"]].to_list()
-    [10.0, 'x', 50]
+    >>> print(table.loc[0, "rate_hz"], table.loc[0, "axes"], table.loc[0, "rows"])
+    10.0 x 50
     """
     names = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     rows: list[dict[str, Any]] = []
@@ -72,11 +73,11 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
-    log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap="100000D")
+    log = raw if regular else regularise(raw, rate=reading.get("rate"))
     start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
     gaps = gap_table(log)
     signal = log[signal_name(log)]
-    notes = dict.fromkeys([*summary.notes, *log.attrs.get("notes", [])])
+    notes = dict.fromkeys(note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *log.attrs.get("notes", [])])
     return {
         "file": str(path),
         "format": summary.format,
@@ -102,7 +103,9 @@ def print_scan(table: pd.DataFrame) -> None:
     from rich.table import Table
 
     console = Console()
-    framed = Table("file", "start", "span", "rate [Hz]", "axes", "channels", "rows", "gaps", "missing")
+    framed = Table()
+    for heading in ("file", "start (UTC)", "span", "rate [Hz]", "axes", "channels", "rows", "gaps", "missing"):
+        framed.add_column(heading, overflow="fold", justify="right" if heading in ("rows", "gaps", "missing") else "left")
     for _, row in table.iterrows():
         if pd.isna(row["rate_hz"]):
             framed.add_row(row["file"], "[red]cannot be read[/red]")
@@ -110,7 +113,7 @@ def print_scan(table: pd.DataFrame) -> None:
         cells = (
             f"{row['file']} ({row['format']})",
             f"{row['start']:%Y-%m-%d %H:%M:%S}",
-            str(pd.Timedelta(seconds=row["span_s"]).round("ms")),
+            _span(row["span_s"]),
             f"{row['rate_hz']:g}",
             row["axes"],
             row["channels"],
@@ -122,3 +125,7 @@ def print_scan(table: pd.DataFrame) -> None:
     console.print(framed)
     for _, row in table[table["odd"].fillna("") != ""].iterrows():
         console.print(f"[bold]{row['file']}[/bold]: {row['odd']}", highlight=False)
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds < 60.0 else str(timedelta(seconds=round(seconds)))
