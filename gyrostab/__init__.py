@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gyrostab.export import to_zarr as to_zarr
     from gyrostab.fit import fit_noise as fit_noise
     from gyrostab.log import make_log as make_log
+    from gyrostab.plot import plot_adev as plot_adev
     from gyrostab.plot import plot_coefficients as plot_coefficients
     from gyrostab.plot import plot_davar as plot_davar
     from gyrostab.plot import plot_davar_3d as plot_davar_3d
@@ -45,6 +46,7 @@ _HOME = {
     "open_log": "export",
     "open_product": "export",
     "open_surface": "export",
+    "plot_adev": "plot",
     "plot_coefficients": "plot",
     "plot_davar": "plot",
     "plot_davar_3d": "plot",
@@ -66,6 +68,7 @@ __all__ = [
     "open_log",
     "open_product",
     "open_surface",
+    "plot_adev",
     "plot_coefficients",
     "plot_davar",
     "plot_davar_3d",

@@ -100,6 +100,7 @@ def print_scan(table: pd.DataFrame) -> None:
         table.to_csv(sys.stdout, sep="\t", index=False)
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console()
@@ -108,7 +109,7 @@ def print_scan(table: pd.DataFrame) -> None:
         framed.add_column(heading, overflow="fold", justify="right" if heading in ("rows", "gaps", "missing") else "left")
     for _, row in table.iterrows():
         if pd.isna(row["rate_hz"]):
-            framed.add_row(row["file"], "[red]cannot be read[/red]")
+            framed.add_row(escape(row["file"]), "[red]cannot be read[/red]")
             continue
         cells = (
             f"{row['file']} ({row['format']})",
@@ -121,10 +122,10 @@ def print_scan(table: pd.DataFrame) -> None:
             f"{row['gaps']:,.0f}",
             f"{row['missing_share']:.2%}",
         )
-        framed.add_row(*cells)
+        framed.add_row(*map(escape, cells))
     console.print(framed)
     for _, row in table[table["odd"].fillna("") != ""].iterrows():
-        console.print(f"[bold]{row['file']}[/bold]: {row['odd']}", highlight=False)
+        console.print(f"[bold]{escape(row['file'])}[/bold]: {escape(row['odd'])}", highlight=False)
 
 
 def _span(seconds: float) -> str:
