@@ -161,7 +161,7 @@ def run_demo(folder: str | Path, *, overwrite: bool = False, stage: Stage = no_s
     product = fit_noise(davar(log, window=WINDOW, step=STEP)).compute()
     to_netcdf(product, files["product.nc"], overwrite=overwrite)
     stage("drawing", 0)
-    _draw(log, product, files)
+    _draw(log, product, files, overwrite=overwrite)
     write_report(product, files["report.html"], log=log, overwrite=overwrite)
     return summarise(product, parts), list(files.values())
 
@@ -176,7 +176,8 @@ def _prepare(folder: Path, *, overwrite: bool) -> dict[str, Path]:
     return {name: check_output(folder / name, overwrite=overwrite) for name in FILES}
 
 
-def _draw(log: xr.Dataset, product: xr.Dataset, files: dict[str, Path]) -> None:
+def _draw(log: xr.Dataset, product: xr.Dataset, files: dict[str, Path], *, overwrite: bool) -> None:
+    from gyrostab.output import new_output
     from gyrostab.plot import plot_coefficients, plot_davar, plot_davar_3d, plot_signal
 
     axis = str(product["axis"].values[0])
@@ -187,4 +188,5 @@ def _draw(log: xr.Dataset, product: xr.Dataset, files: dict[str, Path]) -> None:
         "coefficients.png": plot_coefficients(product),
     }
     for name, figure in figures.items():
-        figure.savefig(files[name], dpi=120)
+        with new_output(files[name], overwrite=overwrite) as temporary:
+            figure.savefig(temporary, dpi=120, format="png")

@@ -50,16 +50,20 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
 @contextmanager
 def _line() -> Iterator[Stage]:
     """One line when the work is done."""
-    begun, most = time.perf_counter(), 0
+    begun = since = time.perf_counter()
+    current, worked = ("", 0), ""
 
     def stage(label: str, samples: int = 0) -> None:
-        nonlocal most
-        most = max(most, samples)
+        nonlocal since, current, worked
+        now, (before, count) = time.perf_counter(), current
+        if count:
+            seconds = max(now - since, 1e-9)
+            worked = f" ({before}: {count:,} samples in {seconds:.1f} s, {count / seconds / 1e6:.2f} Msamples/s)"
+        since, current = now, (label, samples)
 
     yield stage
-    seconds = max(time.perf_counter() - begun, 1e-9)
-    rate = f", {most:,} samples ({most / seconds / 1e6:.2f} Msamples/s)" if most else ""
-    print(f"done in {seconds:.1f} s{rate}", file=sys.stderr)
+    stage("", 0)
+    print(f"done in {time.perf_counter() - begun:.1f} s{worked}", file=sys.stderr)
 
 
 @contextmanager

@@ -25,7 +25,7 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
 
     Parameters
     ----------
-    paths : path or sequence of path
+    paths : path, pattern, or several of them
         Logs in any format that gyrostab reads.
     **reading
         Options of `gyrostab.read.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``.
@@ -51,7 +51,9 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     >>> print(table.loc[0, "rate_hz"], table.loc[0, "axes"], table.loc[0, "rows"])
     10.0 x 50
     """
-    names = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    from gyrostab.read.files import expand
+
+    names = expand(paths)
     rows: list[dict[str, Any]] = []
     errors: list[GyrostabError] = []
     for path in names:

@@ -352,7 +352,7 @@ def test_progress_is_one_plain_line_away_from_a_terminal(log, tmp_path, capfd):
     assert call("run", log, "-o", tmp_path / "a.nc", *WINDOW) == 0
     plain = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("note: ")]
     assert len(plain) == 1
-    assert re.search(r"12,000 samples \(\d+\.\d\d Msamples/s\)", plain[0])
+    assert re.search(r"computing: 12,000 samples in \d+\.\d s, \d+\.\d\d Msamples/s", plain[0])
     assert call("run", log, "-o", tmp_path / "b.nc", *WINDOW, "--quiet-progress") == 0
     assert "done in" not in capfd.readouterr().err
 

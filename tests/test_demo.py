@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import hashlib
+import io
 import runpy
 import shutil
 from pathlib import Path
@@ -18,6 +20,8 @@ from gyrostab.demo import FILES, find_parts, sample_log
 from gyrostab.errors import SchemaError
 from gyrostab.export import open_log, open_product
 
+pytestmark = pytest.mark.xdist_group("demo")  # one worker, one run of the demo
+
 DATA = Path(__file__).resolve().parents[1] / "data"
 
 
@@ -27,10 +31,17 @@ def truth() -> dict[str, dict[str, float]]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("demo")
-    assert main(["demo", "-o", str(folder), "--quiet-progress"]) == 0
-    return folder
+def demo(tmp_path_factory) -> tuple[Path, str]:
+    """The folder that the demo wrote, and what it printed."""
+    folder, shown = tmp_path_factory.mktemp("demo"), io.StringIO()
+    with contextlib.redirect_stdout(shown):
+        assert main(["demo", "-o", str(folder), "--quiet-progress"]) == 0
+    return folder, shown.getvalue()
+
+
+@pytest.fixture(scope="module")
+def folder(demo) -> Path:
+    return demo[0]
 
 
 def test_the_shipped_log_is_what_its_script_writes(tmp_path):
@@ -62,7 +73,7 @@ def test_a_vibration_that_does_not_rise_and_fall_is_refused(levels):
 
 
 def test_demo_finds_what_was_put_in(folder, truth):
-    product = open_product(folder / "product.nc")
+    product = open_product(folder / "product.nc").load()
     second = (product["time"].values - np.datetime64("2026-03-14T08:00:00")) / np.timedelta64(1, "s")
     for axis, true in truth.items():
         for inside, vibrating in (((second < 220), False), ((second > 480) & (second < 600), True), ((second > 660), False)):
@@ -73,9 +84,8 @@ def test_demo_finds_what_was_put_in(folder, truth):
             assert float(part["Q"].median()) == pytest.approx(q_true, rel=0.1), (axis, vibrating)
 
 
-def test_demo_prints_the_table_and_the_files(tmp_path, folder, capsys):
-    assert main(["demo", "-o", str(folder), "--overwrite", "--quiet-progress"]) == 0
-    shown = capsys.readouterr().out
+def test_demo_prints_the_table_and_the_files(demo):
+    folder, shown = demo
     for name in FILES:
         assert (folder / name).stat().st_size > 1000
         assert str(folder / name) in shown
@@ -86,5 +96,8 @@ def test_demo_prints_the_table_and_the_files(tmp_path, folder, capsys):
 
 
 def test_demo_does_not_overwrite(folder, capsys):
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert set(FILES) == {path.name for path in before}
     assert main(["demo", "-o", str(folder)]) == 2
     assert "--overwrite" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
