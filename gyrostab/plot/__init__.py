@@ -1,0 +1,14 @@
+"""Figures of logs, surfaces and products.
+
+Every function returns a `matplotlib.figure.Figure` that belongs to nobody else: no pyplot, no window, no global state.
+Save it with ``figure.savefig("name.png", dpi=150)`` or as ``.svg`` or ``.pdf``.
+"""
+
+from __future__ import annotations
+
+from gyrostab.plot.adev import plot_adev
+from gyrostab.plot.coefficients import plot_coefficients
+from gyrostab.plot.signal import plot_signal
+from gyrostab.plot.surface import plot_davar, plot_davar_3d
+
+__all__ = ["plot_adev", "plot_coefficients", "plot_davar", "plot_davar_3d", "plot_signal"]

@@ -1,0 +1,138 @@
+"""The Allan deviation of one window with its band and the fitted terms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.noise import LAWS
+from gyrostab.plot.style import COLOURS, axis_names, axis_style, new_figure
+from gyrostab.schema import OBSERVABLE, check_surface
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["band", "plot_adev"]
+
+_LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
+_DASHES = ("--", "-.", ":", (0, (6, 2, 1, 2, 1, 2)), (0, (8, 3)))
+
+
+def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
+    """Draw the Allan deviation of one window over averaging time, with its 95 % band and the fitted noise terms.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Surface or product, ``avar`` [degree2 hour-2] and ``edf`` with dims ``(axis, time, tau)``.
+    axis : str
+        The axis.
+    when : datetime-like, optional
+        The window whose centre is nearest; when not given, the best covered window nearest to the middle of the record.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    SchemaError, OptionError
+        When it is no surface, has no such axis, or `when` is outside the record.
+    """
+    check_surface(product)
+    (name,) = axis_names(product, axis)
+    window = product.sel(axis=name).isel(time=_window(product.sel(axis=name), when)).compute()
+    tau = window["tau"].values
+    figure = new_figure(8.0, 5.8)
+    panel = figure.subplots()
+    colour = axis_style(product, name)["color"]
+    low, high = band(window["avar"].values, window["edf"].values)
+    panel.fill_between(tau, np.sqrt(low), np.sqrt(high), color=colour, alpha=0.2, linewidth=0, label="95 % band")
+    deviation = np.sqrt(window["avar"].values)
+    panel.plot(tau, deviation, color=colour, marker="o", markersize=3.5, linewidth=1.2, label=f"axis {name}, measured")
+    if "observable" in window:
+        _draw_terms(panel, window, [other for other in COLOURS if other != colour])
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    shown = deviation[np.isfinite(deviation) & (deviation > 0)]
+    panel.set_xlim(tau.min() / 1.3, tau.max() * 1.3)
+    if not shown.size:
+        panel.set_ylim(0.1, 10.0)
+        panel.text(0.5, 0.5, "no estimate in this window", transform=panel.transAxes, ha="center", va="center")
+    else:
+        panel.set_ylim(shown.min() / 4.0, np.nanmax(np.sqrt(high)) * 1.5)
+    panel.set_xlabel("averaging time τ [s]")
+    panel.set_ylabel("Allan deviation σ(τ) [deg/h]")
+    panel.grid(which="both", alpha=0.25)
+    panel.legend(fontsize="small")
+    stamp = str(np.datetime_as_string(window["time"].values, unit="s")).replace("T", " ")
+    figure.suptitle(f"Allan deviation of axis {name}, window centred on {stamp} UTC")
+    return figure
+
+
+def band(avar: Any, edf: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """95 % confidence limits of an Allan variance from its equivalent degrees of freedom (chi-square).
+
+    Parameters
+    ----------
+    avar : array_like
+        Allan variance, any unit.
+    edf : array_like
+        Equivalent degrees of freedom [1].
+
+    Returns
+    -------
+    low, high : ndarray
+        Limits in the unit of `avar`.
+
+    Examples
+    --------
+    >>> low, high = band(1.0, 10.0)
+    >>> round(float(low), 3), round(float(high), 3)
+    (0.488, 3.08)
+    """
+    from scipy.special import chdtri
+
+    avar, edf = np.asarray(avar, dtype=np.float64), np.asarray(edf, dtype=np.float64)
+    return avar * edf / chdtri(edf, 0.025), avar * edf / chdtri(edf, 0.975)
+
+
+def _window(part: xr.Dataset, when: Any) -> int:
+    time = part["time"].values.astype("datetime64[ns]")
+    if when is None:
+        coverage = part["window_coverage"].values
+        best = np.flatnonzero(coverage >= np.nanmax(coverage) - 1e-9) if np.isfinite(coverage).any() else np.arange(time.size)
+        return int(best[np.argmin(np.abs(best - time.size // 2))])
+    try:
+        stamp = np.datetime64(str(np.datetime64(when))).astype("datetime64[ns]")
+    except ValueError as error:
+        raise OptionError(f"time {when!r} is not understood; write it as 2026-11-20T14:30:00") from error
+    half = np.timedelta64(int(float(part.attrs.get("window_s", 0.0)) * 1e9), "ns")
+    if not time[0] - half <= stamp <= time[-1] + half:
+        raise OptionError(f"time {when} is outside the record, which has windows from {time[0]} to {time[-1]}")
+    return int(np.argmin(np.abs(time - stamp)))
+
+
+def _draw_terms(panel: Axes, window: xr.Dataset, colours: list[str]) -> None:
+    """Draw each observed term as a broken line, their sum as a black one; name the limits in the legend."""
+    tau = window["tau"].values
+    total = np.zeros(tau.size)
+    responses = {"N": "white_response", "Q": "quantization_response"}
+    for number, (symbol, law) in enumerate(LAWS.items()):
+        state = int(window["observable"].sel(term=symbol))
+        value, error, upper = (float(window[f"{symbol}{end}"]) for end in ("", "_stderr", "_upper"))
+        if state == _SEEN:
+            term = law.avar(tau, value)
+            seen = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
+            total += term * np.where(np.isfinite(seen), seen, 1.0)
+            label = f"{symbol} = {value:.3g} ± {error:.1g} {law.label} ({law.name})"
+            panel.plot(tau, np.sqrt(term), linestyle=_DASHES[number], color=colours[number], linewidth=1.3, label=label)
+        elif state == _LIMIT:
+            panel.plot([], [], linestyle="none", label=f"{symbol} < {upper:.3g} {law.label} ({law.name})")
+    if total.any():
+        panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label="sum of the fitted terms")

@@ -1,0 +1,132 @@
+"""The five noise coefficients over time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.noise import LAWS
+from gyrostab.plot.style import GREY, axis_names, axis_style, new_figure, require_coefficients, shade_spans, time_axis, window_text
+from gyrostab.schema import OBSERVABLE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_coefficients"]
+
+_NOT, _LIMIT, _SEEN = (OBSERVABLE.index(name) for name in ("not_observable", "upper_limit_only", "observed"))
+
+
+def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure:
+    """Draw Q, N, B, K and R over time, one panel each: bands are standard errors, triangles pointing down are 95 % upper limits.
+
+    Grey stretches are those where the data cannot tell the coefficient; darker grey, on more axes.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product with the coefficients ``(axis, time)``.
+    axis : str, optional
+        Draw this axis only.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    SchemaError, OptionError
+        When there are no coefficients, or no such axis.
+    """
+    require_coefficients(product)
+    names = axis_names(product, axis)
+    figure = new_figure(10.0, 10.5)
+    panels = figure.subplots(len(LAWS), 1, sharex=True)
+    time = product["time"].values
+    edges = _edges(time)
+    for panel, (symbol, law) in zip(panels, LAWS.items(), strict=True):
+        for name in names:
+            _draw_axis(panel, product.sel(axis=name), symbol, name, axis_style(product, name))
+            hidden = product["observable"].sel(axis=name, term=symbol).values == _NOT
+            if hidden.any():
+                first, last = _runs(hidden)
+                shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(names))
+        _scale(panel, product, symbol, names)
+        panel.set_ylabel(f"{symbol} [{law.label}]")
+        panel.set_title(law.name, loc="left", fontsize="medium", pad=3)
+        panel.grid(alpha=0.3)
+    figure.legend(handles=_key(product, names), loc="outside lower center", ncols=len(names) + 3, fontsize="small", frameon=False)
+    whose = f" of axis {names[0]}" if len(names) == 1 else ""
+    figure.suptitle(", ".join(filter(None, [f"Noise coefficients{whose} over time", window_text(product)])))
+    figure.align_ylabels()
+    time_axis(panels[-1], edges)
+    return figure
+
+
+def _draw_axis(panel: Axes, part: xr.Dataset, symbol: str, name: str, style: dict[str, Any]) -> None:
+    time = part["time"].values
+    state = part["observable"].sel(term=symbol).values
+    value = np.where(state == _SEEN, part[symbol].values, np.nan)
+    error = np.where(state == _SEEN, part[f"{symbol}_stderr"].values, np.nan)
+    upper = np.where(state == _LIMIT, part[f"{symbol}_upper"].values, np.nan)
+    few = time.size <= 80
+    marks = style | {"markersize": 3.5 if few else 2.5, "linewidth": 1.0}
+    panel.plot(time, value, **(marks if few else marks | {"marker": ""}), label=name)
+    if not few:  # a point with no neighbour makes no line
+        known = np.concatenate([[False], np.isfinite(value), [False]])
+        alone = known[1:-1] & ~known[:-2] & ~known[2:]
+        panel.plot(time[alone], value[alone], **marks | {"linestyle": "none", "markersize": 2.0})
+    if few:
+        panel.errorbar(time, value, yerr=np.nan_to_num(error), fmt="none", ecolor=style["color"], elinewidth=0.9, alpha=0.7)
+    else:
+        panel.fill_between(time, value - error, value + error, color=style["color"], alpha=0.25, linewidth=0)
+    marked = np.flatnonzero(np.isfinite(upper))
+    marked = marked[:: max(1, marked.size // 150)]
+    limits = panel.scatter(time[marked], upper[marked], marker="v", s=14, facecolors="none", edgecolors=style["color"], linewidths=0.8)
+    limits.set_gid(f"upper {symbol} {name}")
+
+
+def _scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> None:
+    """Log scale where the numbers span more than a decade, else linear from zero."""
+    chosen = product.sel(axis=names)
+    numbers = np.concatenate([chosen[name].values.ravel() for name in (symbol, f"{symbol}_upper")])
+    numbers = numbers[np.isfinite(numbers) & (numbers > 0)]
+    if numbers.size and numbers.max() > 10 * numbers.min():
+        panel.set_yscale("log")
+        panel.set_ylim(numbers.min() / 1.5, numbers.max() * 1.5)
+    elif numbers.size:
+        panel.set_ylim(0.0, numbers.max() * 1.15)
+    else:
+        panel.set_yticks([])
+        panel.text(0.5, 0.5, "not observable in any window", transform=panel.transAxes, ha="center", va="center")
+
+
+def _key(product: xr.Dataset, names: list[str]) -> list[Any]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    keys: list[Any] = [Line2D([], [], **axis_style(product, name), label=f"axis {name}", markersize=4.0) for name in names]
+    keys.append(Line2D([], [], color="black", marker="|", linestyle="none", markersize=9.0, label="standard error"))
+    keys.append(
+        Line2D([], [], color="black", marker="v", markerfacecolor="none", linestyle="none", markersize=5.0, label="95 % upper limit")
+    )
+    more = " (darker: on more axes)" if len(names) > 1 else ""
+    keys.append(Patch(facecolor=GREY, alpha=0.5, label=f"not observable{more}"))
+    return keys
+
+
+def _edges(time: NDArray[Any]) -> NDArray[Any]:
+    stamps = time.astype("datetime64[ns]").astype(np.int64)
+    half = int(np.median(np.diff(stamps)) // 2) if stamps.size > 1 else 5 * 10**8
+    inner = stamps[:-1] + np.diff(stamps) // 2
+    return np.concatenate([[stamps[0] - half], inner, [stamps[-1] + half]]).astype("datetime64[ns]")
+
+
+def _runs(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """First index of each run of True, and the index after its last."""
+    steps = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
+    return np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)

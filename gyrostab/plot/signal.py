@@ -1,0 +1,146 @@
+"""The recorded signal of every axis, and the channels below."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.plot.style import axis_names, axis_style, new_figure, shade_spans, time_axis, unit_label
+from gyrostab.schema import log_channels, signal_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_signal", "thin"]
+
+_BLOCK = 2**22  # samples read at a time: 32 MiB
+
+
+def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[str] | None = None, columns: int = 1500) -> Figure:
+    """Draw the gyro signal of all axes with the channels below; gaps are grey.
+
+    A long record is thinned to the smallest and largest sample of every column, so no spike is lost; it is read block by block.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        Regular log, ``rate`` [degree hour-1] or ``angle`` [degree] with dims ``(axis, time)``.
+    axis : str, optional
+        Draw this axis only.
+    channels : sequence of str, optional
+        Channels to draw; all of them when not given.
+    columns : int
+        Number of columns that a record is thinned to.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    OptionError
+        When the axis or a channel is not in the log.
+
+    Examples
+    --------
+    >>> from gyrostab.timegrid import time_coordinate
+    >>> values = np.zeros((1, 100)) + 7.0
+    >>> log = xr.Dataset({"rate": (("axis", "time"), values, {"units": "degree hour-1"})}, coords={"axis": ["x"]})
+    >>> plot_signal(log.assign_coords(time_coordinate(0, 100.0, 100))).axes[0].get_ylabel()
+    'x [deg/h]'
+    """
+    name = signal_name(log)
+    axes, known = axis_names(log, axis), log_channels(log)
+    shown = known if channels is None else list(channels)
+    if missing := [channel for channel in shown if channel not in known]:
+        raise OptionError(f"channel {', '.join(missing)} is not in the log; it has {', '.join(known) or 'none'}")
+    figure = new_figure(10.0, 1.2 + 1.7 * len(axes) + 1.4 * len(shown))
+    ratios = [1.2] * len(axes) + [1.0] * len(shown)
+    panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
+    for panel, axis_name in zip(panels, axes, strict=False):
+        _trace(panel, log[name].sel(axis=axis_name), axis_style(log, axis_name)["color"], columns)
+        panel.set_ylabel(f"{axis_name} {unit_label(log[name].attrs.get('units'))}")
+    for panel, channel in zip(panels[len(axes) :], shown, strict=True):
+        _trace(panel, log[channel], "#333333", columns)
+        panel.set_ylabel(f"{channel.replace('_', ' ')}\n{unit_label(log[channel].attrs.get('units'))}".rstrip())
+    _shade_gaps(list(panels), log, columns)
+    what = "Rotation rate" if name == "rate" else "Rotation angle"
+    rate = log.attrs.get("sampling_rate_hz")
+    figure.suptitle(f"{what} as recorded" + (f", {float(rate):g} samples a second" if rate else ""))
+    time_axis(panels[-1], log["time"][[0, -1]].values)
+    figure.align_ylabels()
+    return figure
+
+
+def thin(values: xr.DataArray, *, columns: int = 1500) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Smallest and largest sample of every column of a long record.
+
+    Parameters
+    ----------
+    values : xarray.DataArray
+        One-dimensional, on a time axis; NaN where missing.
+    columns : int
+        Number of columns; a record with fewer samples than twice that stays as it is.
+
+    Returns
+    -------
+    times, low, high : ndarray
+        Time of the first sample of the column, extremes; NaN where the whole column is missing.
+
+    Examples
+    --------
+    >>> record = xr.DataArray(np.arange(12.0), dims="time", coords={"time": np.arange(12)})
+    >>> thin(record, columns=3)
+    (array([0, 4, 8]), array([0., 4., 8.]), array([ 3.,  7., 11.]))
+    """
+    (dim,) = values.dims
+    size = values.size
+    width = -(-size // columns) if size > 2 * columns else 1
+    per_block = max(1, _BLOCK // width) * width
+    low, high = [], []
+    for start in range(0, size, per_block):
+        block = np.asarray(values[start : start + per_block].values, dtype=np.float64)
+        edges = np.arange(0, block.size, width)
+        low.append(np.fmin.reduceat(block, edges))
+        high.append(np.fmax.reduceat(block, edges))
+    times = values[dim][np.arange(0, size, width)].values
+    return times, np.concatenate(low), np.concatenate(high)
+
+
+def _trace(panel: Axes, values: xr.DataArray, colour: str, columns: int) -> None:
+    times, low, high = thin(values, columns=columns)
+    if np.array_equal(low, high, equal_nan=True):
+        lone = times.size < 60 or not np.any(np.isfinite(low[1:]) & np.isfinite(low[:-1]))
+        panel.plot(times, low, color=colour, linewidth=0.7, marker="." if lone else "")
+    else:
+        panel.plot(np.repeat(times, 2), np.stack([low, high], axis=1).ravel(), color=colour, linewidth=0.7)
+    panel.grid(alpha=0.3)
+
+
+def _shade_gaps(panels: list[Axes], log: xr.Dataset, columns: int) -> None:
+    starts, ends = _gaps(log, columns)
+    if not starts.size:
+        return
+    for panel in panels:
+        shade_spans(panel, starts, ends, label="gap: no samples")
+    panels[0].legend(loc="upper right", fontsize="small", framealpha=0.9)
+
+
+def _gaps(log: xr.Dataset, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Start and end of the gaps: from the table when the log has one, else where a whole column is missing on all axes."""
+    if "gap_start" in log.variables and "gap_end" in log.variables:
+        return log["gap_start"].values, log["gap_end"].values
+    signal = log[signal_name(log)]
+    missing = []
+    for number in range(signal.sizes["axis"]):
+        times, low, _ = thin(signal[number], columns=columns)
+        missing.append(np.isnan(low))
+    edges = np.diff(np.concatenate([[0], np.all(missing, axis=0).astype(int), [0]]))
+    first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    return times[first], np.append(times, log["time"].values[-1])[last]

@@ -1,0 +1,137 @@
+"""What the figures share: colours that colour-blind readers tell apart, unit labels, time axes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.units import INNER
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "COLOURS",
+    "MARKERS",
+    "axis_names",
+    "axis_style",
+    "duration",
+    "new_figure",
+    "shade_spans",
+    "time_axis",
+    "unit_label",
+    "window_text",
+]
+
+#: Okabe and Ito's palette, without its yellow, which vanishes in print.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+MARKERS = ("o", "s", "D", "P", "X", "*")
+GREY = "#8c8c8c"
+
+_LABELS = {
+    INNER["rate"]: "deg/h",
+    INNER["angle"]: "deg",
+    INNER["temperature"]: "°C",
+    INNER["rotation_rate"]: "deg/s",
+    INNER["magnetic"]: "µT",
+    "degree_Celsius hour-1": "°C/h",
+    "K hour-1": "°C/h",
+}
+
+
+def unit_label(units: Any) -> str:
+    """Give the field's spelling of a unit, in brackets; empty for a plain number.
+
+    Examples
+    --------
+    >>> unit_label("degree hour-1")
+    '[deg/h]'
+    """
+    text = str(units if units is not None else "1")
+    return "" if text == "1" else f"[{_LABELS.get(text, text)}]"
+
+
+def duration(seconds: float) -> str:
+    """Write a length of time for people.
+
+    Examples
+    --------
+    >>> duration(90.0), duration(0.25), duration(7200)
+    ('1.5 min', '0.25 s', '2 h')
+    """
+    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= size:
+            return f"{seconds / size:.4g} {name}"
+    return f"{seconds:.3g} s"
+
+
+def window_text(product: xr.Dataset) -> str:
+    """How the windows lie, for a title; empty when the attributes do not say."""
+    window, step = product.attrs.get("window_s"), product.attrs.get("step_s")
+    return "" if window is None or step is None else f"windows of {duration(float(window))} every {duration(float(step))}"
+
+
+def axis_names(dataset: xr.Dataset, axis: str | None) -> list[str]:
+    """List the axes to draw; raise `OptionError` when `axis` is not one of them."""
+    names = [str(name) for name in dataset["axis"].values]
+    if axis is None:
+        return names
+    if axis not in names:
+        raise OptionError(f"axis {axis!r} is not in the data; it has {', '.join(names)}")
+    return [axis]
+
+
+def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
+    """Colour and marker of an axis, the same in every figure."""
+    number = [str(name) for name in dataset["axis"].values].index(axis)
+    return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure [inches] that lays itself out."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def time_axis(ax: Axes, times: NDArray[Any]) -> None:
+    """Write dates and times of day under the panel, as short as they can be told apart."""
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+    locator = AutoDateLocator(minticks=4, maxticks=9)  # type: ignore[no-untyped-call]
+    ax.xaxis.set_major_locator(locator)
+    ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    ax.set_xlabel("time (UTC)")
+    if times.size > 1:
+        ax.set_xlim(times[0], times[-1])
+
+
+def shade_spans(ax: Axes, starts: Any, ends: Any, *, label: str | None = None, alpha: float = 0.35, hatch: str | None = None) -> None:
+    """Grey the stretches of time from `starts` to `ends` (datetime64) over the whole height of the panel."""
+    from matplotlib.dates import date2num
+
+    first, last = (np.atleast_1d(date2num(np.asarray(edge))) for edge in (starts, ends))  # type: ignore[no-untyped-call]
+    bars = ax.broken_barh(
+        list(zip(first, last - first, strict=True)),
+        (0.0, 1.0),
+        transform=ax.get_xaxis_transform(),
+        facecolor=GREY,
+        edgecolor="#5a5a5a" if hatch else "none",
+        linewidth=0.0,
+        alpha=alpha,
+        hatch=hatch,
+        label=label,
+        zorder=0.5,
+    )
+    bars.set_gid("shaded")
+
+
+def require_coefficients(product: xr.Dataset) -> None:
+    """Raise `SchemaError` when the dataset holds a surface only."""
+    if "observable" not in product.variables:
+        raise SchemaError("this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') first")

@@ -1,0 +1,222 @@
+"""The dynamic Allan deviation over time and averaging time: heat map and three-dimensional surface."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.plot.style import axis_names, new_figure, time_axis, window_text
+from gyrostab.schema import ESTIMATORS, check_surface
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_davar", "plot_davar_3d"]
+
+CMAP = "viridis"
+CHANGE_CMAP = "PuOr_r"  # two hues that colour-blind readers tell apart, white where nothing changes
+_WEIGHTED = ESTIMATORS.index("weighted_clusters")
+
+
+def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool = False, columns: int = 1500) -> Figure:
+    """Draw the Allan deviation as colour over time and averaging time, one panel an axis.
+
+    Cells with no estimate are hatched grey; cells that were estimated from incomplete clusters carry white dots.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Surface or product, ``avar`` [degree2 hour-2] with dims ``(axis, time, tau)``.
+    axis : str, optional
+        Draw this axis only.
+    relative : bool
+        Draw the ratio to the median over time of the same averaging time, which shows what changes.
+    columns : int
+        With more windows than that, neighbouring windows are averaged in Allan variance.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    SchemaError, OptionError
+        When it is no surface, or has no such axis.
+    """
+    check_surface(product)
+    from matplotlib.colors import LogNorm
+    from matplotlib.patches import Patch
+
+    names = axis_names(product, axis)
+    figure = new_figure(10.0, 1.3 + 2.7 * len(names))
+    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    time, tau = product["time"].values, product["tau"].values
+    cells, merged = _columns(product, names, columns)
+    time_edges, tau_edges = _time_edges(time, merged, product.attrs.get("step_s")), _tau_edges(tau)
+    if relative:
+        cells = [(_over_median(deviation), weighted) for deviation, weighted in cells]
+    norm = LogNorm(*_limits([deviation for deviation, _ in cells], relative=relative))
+    for panel, name, (deviation, weighted) in zip(panels, names, cells, strict=True):
+        panel.set_facecolor("#d0d0d0")
+        panel.patch.set_hatch("////")
+        panel.patch.set_edgecolor("#909090")
+        shown = np.ma.masked_invalid(np.where(deviation > 0, deviation, np.nan))
+        mesh = panel.pcolormesh(time_edges, tau_edges, shown.T, norm=norm, cmap=CHANGE_CMAP if relative else CMAP, rasterized=True)
+        _mark_weighted(panel, time_edges, tau, weighted)
+        panel.set_yscale("log")
+        panel.set_ylabel(f"axis {name}\naveraging time τ [s]")
+    label = "σ(τ) / its median over time" if relative else "Allan deviation σ(τ) [deg/h]"
+    _colour_bar(figure, mesh, list(panels), label, relative=relative)
+    handles: list[Any] = [Patch(facecolor="#d0d0d0", edgecolor="#909090", hatch="////", label="no estimate (gap, or too few terms)")]
+    if any(weighted.any() for _, weighted in cells):
+        handles.append(_dot_key())
+    figure.legend(handles=handles, loc="outside lower left", ncols=2, fontsize="small", frameon=False)
+    text = ", ".join(
+        filter(
+            None,
+            [
+                "Change of the dynamic Allan deviation" if relative else "Dynamic Allan deviation",
+                window_text(product),
+                f"mean of {merged} windows a column" if merged > 1 else "",
+            ],
+        )
+    )
+    figure.suptitle(text)
+    time_axis(panels[-1], time_edges)
+    return figure
+
+
+def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int = 150) -> Figure:
+    """Draw the Allan deviation of one axis as a surface over time and log averaging time.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Surface or product.
+    axis : str, optional
+        The axis; the first one when not given.
+    columns : int
+        Most windows to draw; more are averaged in Allan variance.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    SchemaError, OptionError
+        When it is no surface, or has no such axis.
+    """
+    check_surface(product)
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+    name = axis_names(product, axis)[0]
+    if min(product.sizes["time"], product.sizes["tau"]) < 2:
+        raise OptionError("a surface needs at least two windows and two averaging times; draw this product with plot_adev")
+    ((deviation, _),), merged = _columns(product, [name], columns)
+    time = product["time"].values
+    seconds = (time[::merged] - time[0]) / np.timedelta64(1, "s")
+    unit, size = next((u, s) for u, s in (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0)) if seconds[-1] >= 3 * s or s == 1.0)
+    figure = new_figure(9.0, 6.5)
+    panel: Any = figure.add_subplot(projection="3d")
+    x, y = np.meshgrid(seconds / size, np.log10(product["tau"].values), indexing="ij")
+    with np.errstate(divide="ignore"):
+        z = np.log10(np.where(deviation > 0, deviation, np.nan))
+    panel.plot_surface(x, y, z, cmap=CMAP, rcount=columns, ccount=60, linewidth=0.15, edgecolor="#222222", antialiased=True)
+    panel.set_xlabel(f"time since {str(np.datetime_as_string(time[0], unit='s')).replace('T', ' ')} [{unit}]", labelpad=8)
+    panel.set_ylabel("averaging time τ [s]", labelpad=8)
+    panel.set_zlabel("Allan deviation σ [deg/h]", labelpad=6)
+    for scale in (panel.yaxis, panel.zaxis):
+        scale.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        scale.set_major_formatter(FuncFormatter(lambda power, _: f"$10^{{{power:.0f}}}$"))
+    panel.invert_yaxis()  # the steep side of short averaging times goes to the back and hides nothing
+    panel.view_init(elev=30, azim=-62)
+    panel.set_box_aspect((1.5, 1.15, 0.85), zoom=1.0)
+    figure.suptitle(", ".join(filter(None, [f"Dynamic Allan deviation of axis {name}", window_text(product)])))
+    return figure
+
+
+def _columns(product: xr.Dataset, names: list[str], columns: int) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], int]:
+    """Allan deviation (time, tau) and the mark of weighted cells for each axis, and how many windows one column holds."""
+    size = product.sizes["time"]
+    merged = max(1, -(-size // columns))
+    edges = np.arange(0, size, merged)
+    cells = []
+    for name in names:
+        part = product.sel(axis=name)
+        avar = np.asarray(part["avar"].values, dtype=np.float64)
+        weighted = np.logical_or.reduceat(part["estimator"].values == _WEIGHTED, edges, axis=0)
+        number = np.add.reduceat(np.isfinite(avar).astype(float), edges, axis=0)
+        total = np.add.reduceat(np.nan_to_num(avar, nan=0.0), edges, axis=0)
+        mean = np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
+        cells.append((np.sqrt(mean), weighted & np.isfinite(mean)))
+    return cells, merged
+
+
+def _over_median(deviation: NDArray[Any]) -> NDArray[Any]:
+    out = np.full_like(deviation, np.nan)
+    known = np.isfinite(deviation).any(axis=0)
+    out[:, known] = deviation[:, known] / np.nanmedian(deviation[:, known], axis=0)
+    return out
+
+
+def _limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float, float]:
+    finite = np.concatenate([value[np.isfinite(value) & (value > 0)] for value in values])
+    if not finite.size:
+        return (0.5, 2.0)
+    low, high = np.quantile(finite, [0.001, 0.999])
+    if relative:
+        reach = float(max(1.25, high, 1.0 / low))
+        return (1.0 / reach, reach)
+    return (float(low), float(high if high > low else 1.001 * low))
+
+
+def _colour_bar(figure: Figure, mesh: Any, panels: list[Axes], label: str, *, relative: bool) -> None:
+    bar = figure.colorbar(mesh, ax=panels, label=label, extend="both", pad=0.01)
+    if relative:
+        low, high = mesh.get_clim()
+        ticks = [tick for tick in (0.1, 0.2, 0.33, 0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0) if low <= tick <= high]
+        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+        bar.minorticks_off()
+
+
+def _time_edges(time: NDArray[Any], merged: int, step: Any) -> NDArray[Any]:
+    """Edges of the columns: half-way between window centres."""
+    stamps = time.astype("datetime64[ns]").astype(np.int64)
+    half = int(float(step) * 5e8) if step is not None else int(np.median(np.diff(stamps)) // 2) if stamps.size > 1 else 5 * 10**8
+    inner = [stamps[i - 1] + (stamps[i] - stamps[i - 1]) // 2 for i in range(merged, stamps.size, merged)]
+    return np.array([stamps[0] - half, *inner, stamps[-1] + half]).astype("datetime64[ns]")
+
+
+def _tau_edges(tau: NDArray[Any]) -> NDArray[Any]:
+    logs = np.log(tau)
+    inner = (logs[1:] + logs[:-1]) / 2
+    first, last = (logs[1] - logs[0], logs[-1] - logs[-2]) if tau.size > 1 else (1.0, 1.0)
+    return np.asarray(np.exp([logs[0] - first / 2, *inner, logs[-1] + last / 2]))
+
+
+def _mark_weighted(panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], weighted: NDArray[Any]) -> None:
+    """Put dots on the weighted cells, thinned to what the eye can separate."""
+    columns = np.arange(0, weighted.shape[0], max(1, weighted.shape[0] // 120))
+    rows = np.arange(0, weighted.shape[1], max(1, weighted.shape[1] // 25))
+    chosen = np.zeros_like(weighted)
+    chosen[np.ix_(columns, rows)] = True
+    where = np.argwhere(weighted & chosen)
+    if not where.size and weighted.any():
+        where = np.argwhere(weighted)[:: max(1, int(weighted.sum()) // 500)]
+    if where.size:
+        centres = time_edges[:-1] + (time_edges[1:] - time_edges[:-1]) // 2
+        dots = panel.scatter(centres[where[:, 0]], tau[where[:, 1]], s=5, color="white", edgecolors="black", linewidths=0.3)
+        dots.set_gid("weighted")
+
+
+def _dot_key() -> Any:
+    from matplotlib.lines import Line2D
+
+    style = {"marker": "o", "markersize": 4.0, "markerfacecolor": "white", "markeredgecolor": "black", "linestyle": "none"}
+    return Line2D([], [], **style, label="estimated from incomplete (weighted) clusters")  # type: ignore[arg-type]

@@ -1,0 +1,306 @@
+"""One self-contained HTML page of a product: summary in plain words, coefficients, figures, gaps, notes."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+from datetime import UTC, datetime
+from importlib import metadata, resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.noise import LAWS
+from gyrostab.output import new_output
+from gyrostab.plot.style import duration
+from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_log, check_product
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["write_report"]
+
+_LONGEST_GAPS = 20
+_GAIN = 1.5  # a change of N over the record that is worth a sentence
+
+
+def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.Dataset | None = None, overwrite: bool = False) -> Path:
+    """Write a report on a product as one HTML file that needs nothing beside it.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens.
+    path : path-like
+        The file to make.
+    log : xarray.Dataset, optional
+        The log that the product was made of, to show the signal and the gaps too.
+    overwrite : bool
+        Replace an existing file.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    SchemaError
+        When it is no product, or the log is no log.
+    OutputError
+        When the file exists, or cannot be written.
+    """
+    import jinja2
+
+    check_product(product)
+    if log is not None:
+        check_log(log)
+    source = resources.files("gyrostab").joinpath("report.html.jinja").read_text(encoding="utf-8")
+    template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(source)
+    table = [(str(name), _coefficients(product.sel(axis=name))) for name in product["axis"].values]
+    gaps = None if log is None or "gap_start" not in log.variables else _gaps(log)
+    with new_output(path, overwrite=overwrite) as temporary:
+        text = template.render(
+            title="Gyro stability report",
+            made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            version=_version(),
+            summary=_summary(product),
+            findings=_findings(product, table),
+            facts=_facts(product),
+            table=table,
+            figures=_figures(product, log),
+            gaps=gaps,
+            gap_summary=_gap_summary(log, gaps) if log is not None and gaps else "",
+            notes=_lines(product.attrs.get("notes")),
+            history=_lines(product.attrs.get("history")),
+        )
+        temporary.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def _version() -> str:
+    try:
+        return metadata.version("gyrostab")
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _lines(value: Any) -> list[str]:
+    if value is None:
+        return []
+    return value.splitlines() if isinstance(value, str) else [str(line) for line in value]
+
+
+def _stamp(time: Any) -> str:
+    return str(np.datetime_as_string(np.datetime64(time, "ns"), unit="s")).replace("T", " ")
+
+
+def _span(product: xr.Dataset) -> tuple[Any, Any]:
+    """Return the first and last moment of the record that any window covers."""
+    if "time_bounds" in product.variables:
+        bounds = product["time_bounds"].values
+        return bounds.min(), bounds.max()
+    half = np.timedelta64(int(float(product.attrs.get("window_s", 0.0)) * 5e8), "ns")
+    return product["time"].values[0] - half, product["time"].values[-1] + half
+
+
+def _number(value: float) -> str:
+    return "–" if not np.isfinite(value) else f"{value:.3g}"
+
+
+def _share(share: float) -> str:
+    if 0.0 < share < 0.01:
+        return "< 1 %"
+    return "> 99 %" if 0.99 < share < 1.0 else f"{100.0 * share:.0f} %"
+
+
+def _missing(product: xr.Dataset) -> dict[str, float]:
+    coverage = product["window_coverage"]
+    return {str(name): 1.0 - float(coverage.sel(axis=name).mean()) for name in product["axis"].values}
+
+
+def _files(product: xr.Dataset) -> list[str]:
+    return [Path(name).name for name in _lines(product.attrs.get("source_files"))]
+
+
+def _summary(product: xr.Dataset) -> str:
+    start, end = _span(product)
+    axes = [str(name) for name in product["axis"].values]
+    files = _files(product)
+    origin = f" from {len(files)} file{'s' if len(files) != 1 else ''}" if files else ""
+    rate = product.attrs.get("sampling_rate_hz")
+    speed = f" at {float(rate):g} samples a second" if rate is not None else ""
+    length = duration(float((end - start) / np.timedelta64(1, "s")))
+    return (
+        f"{len(axes)} gyro {'axes' if len(axes) != 1 else 'axis'} ({', '.join(axes)}){speed}{origin}, "
+        f"{length} from {_stamp(start)} to {_stamp(end)} UTC, looked at in {product.sizes['time']} windows."
+    )
+
+
+def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]) -> list[str]:
+    lines = []
+    for axis, rows in table:
+        seen = [f"{row['symbol']} = {row['median']} {row['unit']}" for row in rows if row["median"] != "–"]
+        text = f"Axis {axis}: {', '.join(seen)} (medians)." if seen else f"Axis {axis}: no coefficient is observed in any window."
+        lines.append(text + _change(product.sel(axis=axis)))
+    missing = {axis: share for axis, share in _missing(product).items() if share > 0.0}
+    if missing:
+        lines.append(
+            "Missing samples, mean over the windows: " + ", ".join(f"axis {axis} {_share(share)}" for axis, share in missing.items()) + "."
+        )
+    else:
+        lines.append("No sample is missing in any window.")
+    return lines
+
+
+def _change(part: xr.Dataset) -> str:
+    """Say in a sentence whether angle random walk at the end differs from that at the beginning."""
+    values = part["N"].values[np.isfinite(part["N"].values)]
+    third = values.size // 3
+    if third < 3:
+        return ""
+    first, last = float(np.median(values[:third])), float(np.median(values[-third:]))
+    if first <= 0.0 or last <= 0.0 or max(first, last) < _GAIN * min(first, last):
+        return ""
+    verb = "rises" if last > first else "falls"
+    return f" Angle random walk {verb} from {_number(first)} to {_number(last)} deg/sqrt(h) (medians of the first and last third)."
+
+
+def _facts(product: xr.Dataset) -> list[tuple[str, str]]:
+    attrs = product.attrs
+    start, end = _span(product)
+    tau = product["tau"].values
+    facts = [
+        ("Files", ", ".join(_files(product)) or "not recorded"),
+        ("Span (UTC)", f"{_stamp(start)} to {_stamp(end)}"),
+        ("Axes", ", ".join(str(name) for name in product["axis"].values)),
+        ("Missing samples", ", ".join(f"{axis}: {_share(share)}" for axis, share in _missing(product).items())),
+        ("Averaging times", f"{tau.size}, from {duration(float(tau[0]))} to {duration(float(tau[-1]))}"),
+        ("Windows", str(product.sizes["time"])),
+    ]
+    timed = {"window_s": "Window", "step_s": "Step"}
+    facts += [(label, duration(float(attrs[name]))) for name, label in timed.items() if name in attrs]
+    if "sampling_rate_hz" in attrs:
+        facts.append(("Sampling rate", f"{float(attrs['sampling_rate_hz']):g} Hz"))
+    plain = {"kind": "Kind of signal", "method": "Method", "gaps": "Treatment of gaps", "overlap": "Overlap", "fit_method": "Fit"}
+    facts += [(label, str(attrs[name]).replace("_", " ")) for name, label in plain.items() if name in attrs]
+    shares = [f"{label}: {_share(share)}" for label, share in _estimators(product)]
+    return [*facts, ("Cells of the surface", ", ".join(shares))]
+
+
+def _estimators(product: xr.Dataset) -> list[tuple[str, float]]:
+    labels = ("no estimate", "from complete clusters", "from incomplete (weighted) clusters")
+    counts = np.bincount(np.asarray(product["estimator"].values, dtype=np.int64).ravel(), minlength=len(labels))
+    return [(label, float(counts[number] / counts.sum())) for number, label in enumerate(labels)]
+
+
+def _coefficients(part: xr.Dataset) -> list[dict[str, Any]]:
+    rows = []
+    for symbol, law in LAWS.items():
+        state = part["observable"].sel(term=symbol).values
+        seen, limited = state == OBSERVABLE.index("observed"), state == OBSERVABLE.index("upper_limit_only")
+        values = part[symbol].values[seen]
+        values = values[np.isfinite(values)]
+        limits = part[f"{symbol}_upper"].values[limited]
+        limits = limits[np.isfinite(limits)]
+        low, high = np.quantile(values, [0.05, 0.95]) if values.size else (np.nan, np.nan)
+        rows.append(
+            {
+                "symbol": symbol,
+                "name": law.name,
+                "unit": law.label,
+                "median": _number(float(np.median(values)) if values.size else np.nan),
+                "range": f"{_number(low)} to {_number(high)}" if values.size else "–",
+                "observed": _share(float(seen.mean())),
+                "limited": _share(float(limited.mean())),
+                "limit": f"< {_number(float(np.median(limits)))}" if limits.size else "–",
+            }
+        )
+    return rows
+
+
+def _gaps(log: xr.Dataset) -> list[dict[str, Any]]:
+    """Describe the longest gaps in order of time."""
+    samples = np.asarray(log["gap_samples"].values)
+    chosen = np.sort(np.argsort(-samples, kind="stable")[:_LONGEST_GAPS])
+    causes = str(log["gap_cause"].attrs.get("flag_meanings", " ".join(GAP_CAUSES))).split()
+    rate = float(log.attrs["sampling_rate_hz"])
+    return [
+        {
+            "start": _stamp(log["gap_start"].values[i]),
+            "end": _stamp(log["gap_end"].values[i]),
+            "length": duration(float(samples[i]) / rate),
+            "samples": f"{int(samples[i]):,}".replace(",", " "),
+            "cause": causes[int(log["gap_cause"].values[i])].replace("_", " "),
+        }
+        for i in chosen
+    ]
+
+
+def _gap_summary(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
+    total = log.sizes["gap"]
+    missing = duration(float(np.sum(log["gap_samples"].values)) / float(log.attrs["sampling_rate_hz"]))
+    shown = f" The {len(gaps)} longest are listed." if total > len(gaps) else ""
+    return f"{total} gap{'s' if total != 1 else ''}, {missing} in all.{shown}"
+
+
+def _figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]]:
+    from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
+
+    figures = []
+    if log is not None:
+        figures.append(_embed(plot_signal(log), "Signal as recorded", _READ["signal"]))
+    figures.append(_embed(plot_coefficients(product), "Noise coefficients over time", _READ["coefficients"]))
+    figures.append(_embed(plot_davar(product), "Dynamic Allan deviation", _READ["davar"]))
+    figures.append(_embed(plot_davar(product, relative=True), "Change of the dynamic Allan deviation", _READ["change"]))
+    for name in product["axis"].values:
+        figures.append(_embed(plot_adev(product, str(name)), f"Allan deviation of one window, axis {name}", _READ["adev"]))
+    if min(product.sizes["time"], product.sizes["tau"]) < 2:
+        return figures
+    first = str(product["axis"].values[0])
+    figures.append(_embed(plot_davar_3d(product, axis=first), f"Dynamic Allan deviation as a surface, axis {first}", _READ["davar_3d"]))
+    return figures
+
+
+def _embed(figure: Figure, alt: str, caption: str) -> dict[str, str]:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return {"png": base64.b64encode(buffer.getvalue()).decode("ascii"), "alt": alt, "caption": caption}
+
+
+#: How to read each figure.
+_READ = {
+    "signal": (
+        "Each panel shows one gyro axis or channel against time; a long record is drawn from its lowest to its highest sample, so "
+        "spikes stay visible. Grey marks gaps. Look for spikes, steps and drift, and whether they come together with temperature or "
+        "vibration."
+    ),
+    "coefficients": (
+        "A level line means that the gyro's noise does not change. N is the short-term noise that averaging reduces, B the floor that "
+        "averaging cannot beat, K and R the slow drift, Q the resolution of the output. Bars or bands are standard errors; a triangle "
+        "says that the true value lies below it (with 95 % confidence); grey says that these windows cannot tell."
+    ),
+    "davar": (
+        "Colour is the Allan deviation: how much the rate, averaged over the time on the vertical axis, differs from one average to "
+        "the next. A stable gyro gives horizontal stripes. Stripes that change colour at short averaging times mean more or less "
+        "noise; at long ones, more or less drift. Hatched cells have no estimate; dotted cells rest on incomplete averages beside "
+        "gaps."
+    ),
+    "change": (
+        "The same, divided by what is usual for each averaging time: white is usual, orange is noisier, purple is quieter. Single "
+        "coloured cells at long averaging times are mostly chance, since a window holds few long averages; whole columns or patches "
+        "seldom are."
+    ),
+    "adev": (
+        "Points are the Allan deviation of one window near the middle of the record; at each point the band holds the true value with "
+        "95 % confidence. Broken lines are the fitted noise terms, each with its own slope, and the black line is their sum: where it "
+        "leaves the band again and again, the five terms do not describe this gyro."
+    ),
+    "davar_3d": (
+        "The surface of the first axis; height and colour are the Allan deviation. A furrow or ridge across the surface is an event in "
+        "time; holes are gaps."
+    ),
+}
