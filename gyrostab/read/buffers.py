@@ -60,18 +60,30 @@ class Buffers:
         return columns
 
 
+class _Mapped:
+    """A memory map behind the few attributes that dask asks for; dask copies into memory whatever has a ``copy``."""
+
+    def __init__(self, values: NDArray[Any]):
+        self._values = values
+        self.shape, self.dtype, self.ndim = values.shape, values.dtype, values.ndim
+
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        return np.asarray(self._values[part])
+
+
 def lazily(values: NDArray[Any]) -> Any:
     """A dask array over a memory map; an array in memory is returned as it is."""
     if not isinstance(values, np.memmap):
         return values
     import dask.array
 
-    return dask.array.from_array(values, chunks=CHUNK_ROWS, name=f"gyrostab-column-{uuid.uuid4().hex}", asarray=True)
+    name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty((0,) * values.ndim, dtype=values.dtype)
+    return dask.array.from_array(_Mapped(values), chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta)
 
 
 def park(values: NDArray[Any]) -> Any:
     """Move an array from memory to an unlinked temporary file and wrap it as a dask array."""
     with tempfile.TemporaryFile(prefix="gyrostab-") as file:
-        file.write(np.ascontiguousarray(values).data)
+        file.write(np.ascontiguousarray(values).view(np.int64).data)
         file.flush()
         return lazily(np.memmap(file, dtype=values.dtype, mode="r+", shape=values.shape))

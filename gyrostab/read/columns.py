@@ -404,5 +404,5 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     hour = re.search(r"deg_?(per_?|/)?h|dph", low)
     unit = "deg/h" if hour else "rad/s" if "rad" in low else "deg/s"
     given = "" if split_header(next((h for h in headers if likely in h), ""))[1] else f" --unit gyro={unit}"
-    message = f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: {_listing(names)}"
+    message = f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: {_listing(names, 100)}"
     return FormatError(f'{message}. Say which they are, for instance: --map "{likely}=gyro_x"{given}')

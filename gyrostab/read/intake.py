@@ -184,9 +184,8 @@ class Intake:
         if self.bad_rows:
             notes.append(f"{self.bad_rows} of {rows} rows are unreadable: {_places(self.bad_places, self.bad_rows)}")
         if self.cell_places:
-            notes.append(
-                f"{self.cells} gyro cells hold no number in rows that are readable otherwise: {_places(self.cell_places, self.cell_rows)}"
-            )
+            where = _places(self.cell_places, self.cell_rows)
+            notes.append(f"{self.cells} gyro cells hold no number in rows that are readable otherwise: {where}")
         if self.options.start is not None and self.time is not None:
             notes.append("--start is not used: the file has its own time column")
         return notes

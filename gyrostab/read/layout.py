@@ -155,8 +155,10 @@ def _find_header(path: Path, lines: list[str], content: list[int]) -> tuple[list
         if _is_data(cells, comma=separator == ";"):
             return _commented_header(lines, index, separator, len(cells)), separator, index, index
         names = _header_cells(lines[index], separator)
-        following = [lines[i] for i in content[place + 1 : place + 21]]
-        widths = {len(split_line(line, _separator(line))) for line in following}
+        following = [(_separator(lines[i]), lines[i]) for i in content[place + 1 : place + 21]]
+        rows = [(mark, split_line(line, mark)) for mark, line in following]
+        solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark == ";")]
+        widths = {len(row) for mark, row in solid or rows if mark == separator}
         if not following or len(names) in widths or (separator != BLANK and len(names) + 1 in widths):
             return names, separator, index, index + 1
     raise FormatError(f"{path.name}: no header row or row of numbers in the first {len(lines)} lines; is this a gyro log?")

@@ -6,6 +6,7 @@ The rows of a matrix run along its longer side. Fields of a structure are called
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,21 +53,21 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Variables and their shapes, the stamps of the two ends."""
-    vectors, plan, notes = _look(path, options)
-    rows = vectors[0].rows if vectors else 0
-    return summarise(path, "matlab", plan, options, rows, lambda source, start, stop: vectors[source].part(start, stop), notes)
+    with ExitStack() as stack:
+        vectors, plan, notes = _look(path, options, stack)
+        return summarise(path, "matlab", plan, options, vectors[0].rows, lambda source, a, b: vectors[source].part(a, b), notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a MATLAB file; see `gyrostab.read.read_log`."""
-    vectors, plan, notes = _look(path, options)
-    notes += float32_note(plan, [vector.array.dtype for vector in vectors])
-    rows = vectors[0].rows if vectors else 0
-    return read_columns(plan, options, rows, lambda source, a, b: vectors[source].part(a, b), notes=notes, limit=limit)
+    with ExitStack() as stack:
+        vectors, plan, notes = _look(path, options, stack)
+        notes += float32_note(plan, [vector.array.dtype for vector in vectors])
+        return read_columns(plan, options, vectors[0].rows, lambda source, a, b: vectors[source].part(a, b), notes=notes, limit=limit)
 
 
-def _look(path: Path, options: ReadOptions) -> tuple[list[_Vector], Plan, list[str]]:
-    found = [vector for name, array in _arrays(path) for vector in _vectors(name, array)]
+def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vector], Plan, list[str]]:
+    found = [vector for name, array in _arrays(path, stack) for vector in _vectors(name, array)]
     if not found:
         raise FormatError(
             f"{path.name}: there is no vector or matrix of numbers in it (tables and objects are not read; save plain arrays)"
@@ -88,11 +89,11 @@ def _vectors(name: str, array: Any) -> Iterator[_Vector]:
         yield _Vector(name, array, None, int(np.argmax(shape)))
 
 
-def _arrays(path: Path) -> Iterator[tuple[str, Any]]:
+def _arrays(path: Path, stack: ExitStack) -> Iterator[tuple[str, Any]]:
     with path.open("rb") as file:
         head = file.read(1024)
     if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head:
-        yield from _arrays_hdf(path)
+        yield from _arrays_hdf(path, stack)
         return
     from scipy.io import loadmat
 
@@ -113,11 +114,11 @@ def _flatten(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-def _arrays_hdf(path: Path) -> Iterator[tuple[str, Any]]:
+def _arrays_hdf(path: Path, stack: ExitStack) -> Iterator[tuple[str, Any]]:
     import h5py
 
     try:
-        file = h5py.File(path, "r")
+        file = stack.enter_context(h5py.File(path, "r"))
     except OSError as error:
         raise FormatError(f"{path.name}: this MATLAB 7.3 file cannot be opened ({error}); it may be cut off, copy it again") from error
     found: list[tuple[str, Any]] = []

@@ -54,9 +54,13 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Variables and sizes, the stamps of the two ends."""
     log = _open_log(path)
     if log is not None:
-        return _summarise_log(path, log)
-    columns, rows, plan, notes = _look(path, options)
-    return summarise(path, "netcdf", plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes)
+        with log:
+            return _summarise_log(path, log)
+    import netCDF4
+
+    with netCDF4.Dataset(path) as file:
+        columns, rows, plan, notes = _look(path, file, options)
+        return summarise(path, "netcdf", plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
@@ -64,26 +68,30 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     log = _open_log(path)
     if log is not None:
         return log
-    columns, rows, plan, notes = _look(path, options)
-    notes += float32_note(plan, [column.variable.dtype for column in columns])
-    return read_columns(plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes=notes, limit=limit)
+    import netCDF4
+
+    with netCDF4.Dataset(path) as file:
+        columns, rows, plan, notes = _look(path, file, options)
+        notes += float32_note(plan, [column.variable.dtype for column in columns])
+        return read_columns(plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes=notes, limit=limit)
 
 
 def _open_log(path: Path) -> xr.Dataset | None:
     """The file as a regular log of gyrostab, or None when it is something else."""
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
+    extra: Any = {"consolidated": False} if path.is_dir() else {}
     try:
-        bare = xr.open_dataset(path, engine=engine, decode_cf=False, chunks=None)
+        stored = xr.open_dataset(path, engine=engine, chunks={}, decode_times=False, **extra)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
-    dims, regular = set(bare.dims), "sampling_rate_hz" in bare.attrs
-    has_signal = any(name in bare.variables for name in SIGNAL_UNITS)
-    bare.close()
-    if not (regular and has_signal and {"axis", "time"} <= dims):
+    has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
+    if not (has_signal and "sampling_rate_hz" in stored.attrs and {"axis", "time"} <= set(stored.variables)):
+        stored.close()
         if path.is_dir():
             raise FormatError(f"{path.name}: this Zarr store is no gyrostab log (axis and time, attribute sampling_rate_hz)")
         return None
-    log = xr.open_dataset(path, engine=engine, chunks={})
+    log = xr.decode_cf(stored)
+    log.set_close(stored.close)
     try:
         for name in log.variables:
             units = log[name].attrs.get("units")
@@ -130,17 +138,18 @@ def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
         columns=(*axes, *others),
         axes=tuple(str(axis) for axis in log["axis"].values),
         channels=tuple(channels),
-        first=np.datetime64(log["time"][0].values, "ns"),
-        last=np.datetime64(log["time"][-1].values, "ns"),
+        first=_stamp(log, 0),
+        last=_stamp(log, -1),
         n_rows=log.sizes["time"],
         notes=tuple(log.attrs.get("notes", ())),
     )
 
 
-def _look(path: Path, options: ReadOptions) -> tuple[list[_Column], int, Plan, list[str]]:
-    import netCDF4
+def _stamp(log: xr.Dataset, place: int) -> np.datetime64:
+    return np.datetime64(int(log["time"][place].values.astype("datetime64[ns]").view(np.int64)), "ns")
 
-    file = netCDF4.Dataset(path)
+
+def _look(path: Path, file: Any, options: ReadOptions) -> tuple[list[_Column], int, Plan, list[str]]:
     numeric = [v for v in file.variables.values() if getattr(v.dtype, "kind", "O") in "iuf" and v.ndim in (1, 2)]
     lines = Counter(v.dimensions[0] for v in numeric if v.ndim == 1)
     lines.update(max(v.dimensions, key=lambda d: len(file.dimensions[d])) for v in numeric if v.ndim == 2)

@@ -56,9 +56,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
             file.seek(max(layout.offset, size - 2**14))
             tail = [split_line(line, layout.separator) for line in file.read().decode("latin-1").splitlines()]
             if time is not None:
-                gyro = [column.source for column in plan.of("gyro")]
-                solid = [row for row in tail if len(row) == layout.width and (not gyro or any(_is_value(row[at], layout) for at in gyro))]
-                ends = _stamps(layout, time, solid, options)
+                ends = _stamps(layout, time, [row for row in tail if _is_solid(row, layout, time.source)], options)
                 last = next((int(stamp) for stamp in ends[::-1] if stamp != NAT), None)
             if size <= COUNTED_BYTES:
                 file.seek(layout.offset)
@@ -104,8 +102,10 @@ def _stamps(layout: Layout, time: Column, rows: Sequence[Sequence[str]], options
     return cells_to_ns(cells, time.time_unit, options.epoch_ns)
 
 
-def _is_value(cell: str, layout: Layout) -> bool:
-    return is_number(cell, comma=layout.decimal_comma)
+def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
+    """Whether a row holds a number beside its stamp."""
+    others = (cell for at, cell in enumerate(row) if at != time)
+    return len(row) == layout.width and (layout.width == 1 or any(is_number(cell, comma=layout.decimal_comma) for cell in others))
 
 
 def _gzipped(path: Path) -> bool:

@@ -1,0 +1,280 @@
+"""Many files to one log, channels of other files, gyrostab's own logs, and the registry."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+
+import gyrostab.read.files as files
+from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, UnitError
+from gyrostab.read import FileSummary, ReadOptions, read_log, readers, scan_file
+from gyrostab.schema import check_log, check_raw
+from gyrostab.timegrid import TimeGridIndex, time_coordinate
+
+HEADER = "time [s],gyro_x [deg/h],gyro_y [deg/h],temperature [degC]\n"
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> list[Path]:
+    """Two pieces of a log in the wrong order, the earlier one without gyro_y and temperature."""
+    late = write(tmp_path / "a.csv", HEADER + "10,1,2,20\n11,3,4,\n12,****,5,21\n")
+    early = write(tmp_path / "b.csv", "time [ms],gyro_x [deg/s],depth [m]\n0,1,7\n1000,2,8\n")
+    return [late, early]
+
+
+def test_files_are_joined_in_the_order_of_their_stamps(pair: list[Path]) -> None:
+    raw = read_log(pair)
+    check_raw(raw)
+    assert raw.attrs["source_files"] == ["b.csv", "a.csv"]
+    assert raw.attrs["row_start"] == [0, 2]
+    np.testing.assert_array_equal(raw.time.values, np.array([0, 1, 10, 11, 12], dtype="datetime64[s]"))
+    nan = np.nan
+    np.testing.assert_array_equal(raw.rate, [[3600, 7200, 1, 3, nan], [nan, nan, 2, 4, 5]])
+    np.testing.assert_array_equal(raw.temperature, [nan, nan, 20, nan, 21])
+    np.testing.assert_array_equal(raw.depth, [7, 8, nan, nan, nan])
+    notes = " | ".join(raw.attrs["notes"])
+    assert "axis y is not in b.csv and is missing there" in notes
+    assert "channel depth is not in a.csv" in notes
+    assert raw.attrs["unreadable_cells"] == 1
+
+
+def test_patterns_and_repeated_paths(pair: list[Path]) -> None:
+    folder = pair[0].parent
+    xr.testing.assert_identical(read_log(str(folder / "*.csv")), read_log(pair))
+    xr.testing.assert_identical(read_log([*pair, pair[0]]), read_log(pair))
+    with pytest.raises(FormatError, match="no file fits"):
+        read_log(folder / "*.tsv")
+    with pytest.raises(FormatError, match="no such file"):
+        read_log(folder / "nothing.csv")
+    with pytest.raises(OptionError, match="at least one"):
+        read_log([])
+    with pytest.raises(FormatError, match=r"no reader takes this file with the suffix '.xyz'.*text"):
+        read_log(write(folder / "log.xyz", "?"))
+    with pytest.raises(FormatError, match="no reader takes this directory"):
+        read_log(folder)
+
+
+def test_many_files_wait_on_disk(pair: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = read_log(pair)
+    monkeypatch.setattr(files, "SPILL_BYTES", 100)
+    raw = read_log(pair)
+    assert raw.rate.chunks is not None
+    xr.testing.assert_identical(raw.compute(), expected)
+
+
+def test_files_without_stamps_keep_their_order_and_do_not_mix(tmp_path: Path) -> None:
+    first, second = (write(tmp_path / name, f"gyro_x [deg/h]\n{value}\n{value}\n") for name, value in (("z.csv", 1), ("a.csv", 2)))
+    raw = read_log([first, second], rate=10, start="2026-01-01")
+    np.testing.assert_array_equal(raw.rate[0], [1, 1, 2, 2])
+    assert raw.attrs["start"] == "2026-01-01"
+    timed = write(tmp_path / "timed.csv", "time [s],gyro_x [deg/h]\n0,1\n1,2\n")
+    with pytest.raises(TimeError, match=r"timed.csv has time stamps and z.csv has none"):
+        read_log([first, timed], rate=10)
+
+
+def test_kinds_and_channel_units_must_agree(tmp_path: Path) -> None:
+    rate = write(tmp_path / "rate.csv", "time [s],gyro_x [deg/h],flow [l/min]\n0,1,1\n1,2,1\n")
+    angle = write(tmp_path / "angle.csv", "time [s],angle_x [deg]\n2,1\n3,2\n")
+    other = write(tmp_path / "other.csv", "time [s],gyro_x [deg/h],flow [m3/h]\n2,1,1\n3,2,1\n")
+    with pytest.raises(UnitError, match=r"rate.csv holds a gyro signal of kind 'rate', angle.csv of kind 'increment'"):
+        read_log([rate, angle], kind="rate")
+    with pytest.raises(UnitError, match=r"channel 'flow' has different units"):
+        read_log([rate, other])
+
+
+def test_a_map_that_fits_one_of_the_files_is_no_slip(pair: list[Path]) -> None:
+    raw = read_log(pair, map={"depth": "bit_depth"})
+    assert "bit_depth" in raw
+    with pytest.raises(OptionError, match=r"--map depht: no such column in a.csv, b.csv"):
+        read_log(pair, map={"depht": "bit_depth"})
+
+
+def test_channels_of_another_file_keep_their_own_time(tmp_path: Path) -> None:
+    log = write(tmp_path / "log.csv", "time [s],gyro_x [deg/h]\n" + "".join(f"{n},{n}\n" for n in range(10)))
+    rows = "1970-01-01T00:00:00,20,\n1970-01-01T00:00:04,,101325\nnever,21,1\n1970-01-01T00:00:08,22,\n" + "1970-01-01T00:00:09,,\n" * 5
+    slow = write(tmp_path / "slow.csv", "time,temperature [degC],pressure [Pa],gyro_x [deg/h]\n" + rows.replace("\n", ",1\n"))
+    raw = read_log(log, channel=slow)
+    check_raw(raw)
+    assert raw.temperature.dims == ("time_temperature",)
+    np.testing.assert_array_equal(raw.temperature, [20, 22])
+    np.testing.assert_array_equal(raw.time_temperature.values, np.array([0, 8], dtype="datetime64[s]"))
+    np.testing.assert_array_equal(raw.pressure, [101325])
+    assert raw.temperature.attrs["units"] == "degree_Celsius"
+    np.testing.assert_array_equal(raw.rate[0], np.arange(10))
+    more = write(tmp_path / "more.csv", "time [s],temperature [K]\n-2,273.15\n-1,274.15\n")
+    both = read_log(log, channel=[slow, more])
+    np.testing.assert_allclose(both.temperature, [0, 1, 20, 22])
+    assert both.attrs["channel_files"] == ["slow.csv", "more.csv"]
+
+
+def test_channel_files_that_cannot_serve_are_explained(tmp_path: Path) -> None:
+    log = write(tmp_path / "log.csv", HEADER + "0,1,1,20\n1,1,1,20\n")
+    doubled = write(tmp_path / "slow.csv", "time [s],temperature [degC]\n0,1\n1,1\n")
+    with pytest.raises(OptionError, match=r"channel 'temperature' of slow.csv is in the log too.*--map temperature=temperature_2"):
+        read_log(log, channel=doubled)
+    with pytest.raises(OptionError, match=r"no channel with a unit"):
+        read_log(log, channel=write(tmp_path / "bare.csv", "time [s],speed\n0,1\n1,1\n"))
+    with pytest.raises(OptionError, match=r"no time column"):
+        read_log(log, channel=write(tmp_path / "timeless.csv", "flow [m3/h]\n1\n1\n"))
+
+
+def test_channels_from_netcdf(tmp_path: Path) -> None:
+    log = write(tmp_path / "log.csv", "time [s],gyro_x [deg/h]\n0,1\n1,2\n")
+    with netCDF4.Dataset(tmp_path / "slow.nc", "w") as file:
+        file.createDimension("time", 3)
+        time = file.createVariable("time", "i4", ("time",))
+        time.units = "seconds since 1970-01-01"
+        time[:] = [0, 5, 9]
+        pressure = file.createVariable("pressure", "f4", ("time",))
+        pressure.units = "kPa"
+        pressure[:] = [1, 2, 3]
+    np.testing.assert_array_equal(read_log(log, channel=tmp_path / "slow.nc").pressure, [1000, 2000, 3000])
+
+
+# --- logs that gyrostab wrote ------------------------------------------------------------------------------------
+
+
+def regular_log(size: int = 5000, rate: float = 300.0) -> xr.Dataset:
+    rng = np.random.default_rng(3)
+    start = int(np.datetime64("2026-01-01T00:00:00.000000007", "ns").astype(np.int64))
+    slow = np.datetime64("2026-01-01", "ns") + np.arange(4) * np.timedelta64(3, "s")
+    return xr.Dataset(
+        {
+            "rate": (("axis", "time"), rng.normal(size=(2, size)), {"units": "degree hour-1"}),
+            "vibration": ("time", rng.uniform(size=size), {"units": "9.80665 m s-2"}),
+            "temperature": ("time_temperature", np.arange(4.0), {"units": "degree_Celsius"}),
+        },
+        coords={"axis": ["x", "z"], "time_temperature": slow, **time_coordinate(start, rate, size)},
+        attrs={"kind": "rate", "sampling_rate_hz": rate},
+    )
+
+
+def store(log: xr.Dataset, path: Path) -> Path:
+    plain = log.assign_coords(time=("time", log.time.values)).drop_indexes("time") if "time" in log.xindexes else log
+    encoding = {"time": {"units": "nanoseconds since 2026-01-01", "dtype": "int64"}}
+    if path.suffix == ".zarr":
+        plain.chunk(time=1000).to_zarr(path, encoding=encoding, consolidated=False)
+    else:
+        plain.to_netcdf(path, encoding={**encoding, "axis": {"dtype": "S1"}})  # netCDF-C crashes on strings of a file opened twice
+    return path
+
+
+@pytest.mark.parametrize("name", ["log.nc", "log.zarr"])
+@pytest.mark.filterwarnings("ignore:.*does not have a Zarr V3 specification.*")
+def test_a_log_of_gyrostab_comes_back_lazily_on_its_exact_grid(tmp_path: Path, name: str) -> None:
+    log = regular_log()
+    path = store(log, tmp_path / name)
+    back = read_log(path)
+    check_log(back)
+    assert back.rate.chunks is not None
+    assert isinstance(back.xindexes["time"], TimeGridIndex)
+    np.testing.assert_array_equal(back.time.values, log.time.values)
+    np.testing.assert_array_equal(back.rate, log.rate)
+    assert list(back.axis.values) == ["x", "z"]
+    assert back.vibration.attrs["units"] == "g"
+    assert back.temperature.dims == ("time_temperature",)
+    summary = scan_file(path)
+    assert (summary.format, summary.axes, summary.n_rows) == ("gyrostab log", ("x", "z"), 5000)
+    assert summary.channels == ("vibration", "temperature")
+    assert (summary.first, summary.last) == (log.time.values[0], log.time.values[-1])
+
+
+@pytest.mark.parametrize("name", ["log.nc", "log.zarr"])
+def test_what_export_writes_is_read(tmp_path: Path, name: str) -> None:
+    from gyrostab import export
+
+    log = regular_log()
+    log["vibration"].attrs["units"] = "g"
+    write_log = export.to_netcdf if name.endswith(".nc") else export.to_zarr
+    path = write_log(log, tmp_path / name)
+    back, opened = read_log(path), export.open_log(path)
+    assert isinstance(back.xindexes["time"], TimeGridIndex)
+    for variable in log.variables:
+        np.testing.assert_array_equal(back[variable].values, log[variable].values)
+        assert back[variable].attrs.get("units") == opened[variable].attrs.get("units")
+    assert back.attrs["sampling_rate_hz"] == 300.0
+    assert scan_file(path).axes == ("x", "z")
+
+
+def test_stored_stamps_off_the_grid_are_kept_and_said(tmp_path: Path) -> None:
+    log = regular_log(500)
+    stamps = log.time.values.copy()
+    stamps[300:] += np.timedelta64(1, "ms")
+    path = store(log.drop_vars("time").assign_coords(time=stamps), tmp_path / "log.nc")
+    back = read_log(path)
+    np.testing.assert_array_equal(back.time.values, stamps)
+    assert any("stamp 300" in note and "off the grid of 300 Hz" in note for note in back.attrs["notes"])
+
+
+def test_a_log_takes_channels_but_is_not_joined(tmp_path: Path) -> None:
+    path = store(regular_log(), tmp_path / "log.nc")
+    extra = write(tmp_path / "extra.csv", "time,pressure [Pa]\n2026-01-01T00:00:01,5\n2026-01-01T00:00:02,6\n")
+    log = read_log(path, channel=extra)
+    check_log(log)
+    np.testing.assert_array_equal(log.pressure, [5, 6])
+    with pytest.raises(OptionError, match=r"log.nc is a regular log already"):
+        read_log([path, store(regular_log(), tmp_path / "second.nc")])
+    raw = read_log(write(tmp_path / "raw.csv", "time,gyro_x [deg/h]\n2026-01-01T00:00:00,5\n2026-01-01T00:00:02,6\n"), channel=path)
+    assert raw.vibration.sizes["time_vibration"] == 5000
+    assert raw.temperature.sizes["time_temperature"] == 4
+
+
+def test_a_log_in_wrong_units_is_refused(tmp_path: Path) -> None:
+    log = regular_log()
+    log["rate"].attrs["units"] = "degree s-1"
+    with pytest.raises(SchemaError, match=r"log.nc: variable 'rate' has units 'degree s-1'"):
+        read_log(store(log, tmp_path / "log.nc"))
+
+
+# --- registry ----------------------------------------------------------------------------------------------------
+
+
+class _Point:
+    """An entry point of a format that another package brings."""
+
+    name = "counts"
+
+    @staticmethod
+    def load() -> type:
+        class Counts:
+            @staticmethod
+            def matches(path: Path) -> bool:
+                return path.suffix == ".counts"
+
+            @staticmethod
+            def scan(path: Path, options: ReadOptions) -> FileSummary:
+                return FileSummary(path, "counts")
+
+            @staticmethod
+            def read(path: Path, options: ReadOptions) -> xr.Dataset:
+                text = path.with_suffix(".csv")
+                text.write_text("gyro_x [deg/h]\n" + path.read_text())
+                return files._registered()["text"].load().read(text, options)
+
+        return Counts
+
+
+def test_a_format_of_another_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = {**files._registered(), "counts": _Point()}
+    monkeypatch.setattr(files, "_registered", lambda: points)
+    path = write(tmp_path / "log.counts", "1\n2\n3\n")
+    assert "counts" in readers()
+    assert scan_file(path).format == "counts"
+    np.testing.assert_array_equal(read_log(path, rate=1).rate[0], [1, 2, 3])
+
+
+def test_heavy_libraries_load_when_they_are_used() -> None:
+    code = "import sys, gyrostab.read; print([m for m in ('pyarrow.csv', 'netCDF4', 'h5py', 'scipy.io', 'dask.array') if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

@@ -1,0 +1,296 @@
+"""The contract that every format passes: the same data in every format give the same raw log."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import netCDF4
+import numpy as np
+import pyarrow as pa
+import pytest
+import xarray as xr
+from pyarrow import parquet
+from scipy.io import savemat
+
+from gyrostab.errors import FormatError, MissingUnitError, OptionError
+from gyrostab.read import ReadOptions, read_log, readers, scan_file
+from gyrostab.read.buffers import Buffers, lazily, park
+from gyrostab.schema import check_raw
+
+ROWS = 500
+START_US = 1_767_225_600_000_000  # 2026-01-01
+HEADERS = ["time [us]", "gyro_y [deg/s]", "gyro_x [deg/s]", "temperature [K]", "humidity [%]"]
+
+
+def columns() -> list[np.ndarray]:
+    """Integer stamps with jitter, two axes in the wrong order, a slow channel and one of a name that nobody knows."""
+    rng = np.random.default_rng(7)
+    stamps = START_US + 2500 * np.arange(ROWS) + rng.integers(-3, 4, ROWS)
+    gyro = np.round(rng.normal(size=(2, ROWS)), 6)
+    gyro[0, 20] = np.nan
+    temperature = np.full(ROWS, np.nan)
+    temperature[::50] = 300.0 + np.arange(ROWS // 50)
+    return [stamps, *gyro, temperature, np.round(rng.uniform(size=ROWS), 4)]
+
+
+def as_text(path: Path, separator: str = ",") -> dict[str, Any]:
+    void = "nan" if separator == " " else ""
+    rows = [
+        separator.join(str(int(v)) if i == 0 else void if np.isnan(v) else repr(float(v)) for i, v in enumerate(row))
+        for row in zip(*columns(), strict=True)
+    ]
+    text = "# tool 7\n" + separator.join(HEADERS) + "\n" + "\n".join(rows) + "\n"
+    if path.suffix == ".gz":
+        path.write_bytes(gzip.compress(text.encode()))
+    else:
+        path.write_text(text)
+    return {}
+
+
+def as_parquet(path: Path) -> dict[str, Any]:
+    parquet.write_table(pa.table(dict(zip(HEADERS, columns(), strict=True))), path, row_group_size=170)
+    return {}
+
+
+def _bare() -> dict[str, tuple[str, np.ndarray]]:
+    names = [header.split(" [") for header in HEADERS]
+    return {name: (unit.rstrip("]"), values) for (name, unit), values in zip(names, columns(), strict=True)}
+
+
+def as_netcdf(path: Path) -> dict[str, Any]:
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("obs", ROWS)
+        for name, (unit, values) in _bare().items():
+            variable = file.createVariable(name, values.dtype, ("obs",))
+            variable.units = unit
+            variable[:] = values
+    return {}
+
+
+def as_netcdf_matrix(path: Path) -> dict[str, Any]:
+    bare = _bare()
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("obs", ROWS)
+        file.createDimension("axis", 2)
+        file.createVariable("axis", str, ("axis",))[:] = np.array(["y", "x"], dtype=object)
+        gyro = file.createVariable("gyro", "f8", ("axis", "obs"))
+        gyro.units = "deg/s"
+        gyro[:] = np.stack([bare.pop("gyro_y")[1], bare.pop("gyro_x")[1]])
+        for name, (unit, values) in bare.items():
+            variable = file.createVariable(name, values.dtype, ("obs",))
+            variable.units = "microseconds since 2000-01-01T00:00:00Z" if name == "time" else unit
+            variable[:] = values - (946_684_800_000_000 if name == "time" else 0)
+    return {}
+
+
+UNITS = {"time": "us", "gyro": "deg/s", "temperature": "K", "humidity": "%"}
+
+
+def as_mat5(path: Path) -> dict[str, Any]:
+    savemat(path, {name: values for name, (_, values) in _bare().items()}, oned_as="column")
+    return {"unit": UNITS}
+
+
+def as_mat5_matrix(path: Path) -> dict[str, Any]:
+    bare = _bare()
+    names = list(bare)
+    table = np.stack([bare[name][1] for name in names[1:]])
+    savemat(path, {"log": {"t": bare["time"][1], "DATA": table}, "note": "text", "scalar": 3.0})
+    return {"unit": UNITS, "map": {"log.t": "time", **{f"log.DATA/{i}": name for i, name in enumerate(names[1:])}}}
+
+
+def as_mat73(path: Path) -> dict[str, Any]:
+    bare = _bare()
+    names = list(bare)
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["DATA"] = np.stack([bare[name][1] for name in names[1:]])
+        file["stamp"] = bare["time"][1].reshape(1, -1)
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: none".ljust(124) + b"\x00\x02IM")
+    return {"unit": UNITS, "map": {"stamp": "time", **{f"DATA/{i}": name for i, name in enumerate(names[1:])}}}
+
+
+#: file name -> maker; the maker returns the reading options that the format needs.
+CONTRACT: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "comma.csv": as_text,
+    "comma.csv.gz": as_text,
+    "semicolon.txt": lambda path: as_text(path, ";"),
+    "tab.tsv": lambda path: as_text(path, "\t"),
+    "blanks.dat": lambda path: as_text(path, " "),
+    "table.parquet": as_parquet,
+    "vectors.nc": as_netcdf,
+    "matrix.nc": as_netcdf_matrix,
+    "vectors.mat": as_mat5,
+    "matrix.mat": as_mat5_matrix,
+    "hdf.mat": as_mat73,
+}
+
+
+@pytest.fixture(params=CONTRACT, scope="module")
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    path = tmp_path_factory.mktemp("contract") / request.param
+    return path, CONTRACT[request.param](path)
+
+
+def test_every_registered_format_is_in_the_table() -> None:
+    assert {"text", "parquet", "netcdf", "matlab"} <= set(readers())
+
+
+def test_the_raw_log_is_the_same_in_every_format(made: tuple[Path, dict[str, Any]]) -> None:
+    path, options = made
+    raw = read_log(path, **options)
+    check_raw(raw)
+    stamps, gyro_y, gyro_x, temperature, humidity = columns()
+    np.testing.assert_array_equal(raw.time.values, stamps.astype("datetime64[us]").astype("datetime64[ns]"))
+    assert raw.time.dtype == "datetime64[ns]"
+    assert list(raw.axis.values) == ["x", "y"]
+    np.testing.assert_array_equal(raw.rate.sel(axis="x"), gyro_x * 3600.0)
+    np.testing.assert_array_equal(raw.rate.sel(axis="y"), gyro_y * 3600.0)
+    np.testing.assert_allclose(raw.temperature, temperature - 273.15, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(raw.humidity, humidity)
+    assert raw.rate.attrs["units"] == "degree hour-1"
+    assert (raw.temperature.attrs["units"], raw.humidity.attrs["units"]) == ("degree_Celsius", "%")
+    assert raw.attrs["kind"] == "rate"
+    assert raw.attrs["source_files"] == [path.name]
+    assert raw.attrs["row_start"] == [0]
+    assert (raw.attrs["unreadable_rows"], raw.attrs["unreadable_cells"]) == (0, 1)
+
+
+def test_a_scan_agrees_with_the_reading(made: tuple[Path, dict[str, Any]]) -> None:
+    path, options = made
+    summary = scan_file(path, ReadOptions(**options))
+    raw = read_log(path, **options)
+    assert summary.axes == ("x", "y")
+    assert set(summary.channels) == {"temperature", "humidity"}
+    assert summary.first == raw.time.values[0]
+    assert summary.last in (None, raw.time.values[-1])
+    assert summary.n_rows in (None, ROWS)
+    if path.suffix != ".gz":
+        assert (summary.last, summary.n_rows) == (raw.time.values[-1], ROWS)
+    roles = {column.name: (column.role, column.unit) for column in summary.columns}
+    assert roles["gyro_x"] == ("gyro", "deg/s")
+    assert roles["time"][0] == "time"
+
+
+def test_columns_on_disk_hold_what_columns_in_memory_hold(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+    path, options = made
+    in_memory = read_log(path, **options)
+    module = __import__(f"gyrostab.read.{scan_file(path).format}", fromlist=["read"])
+    on_disk = module.read(path, ReadOptions(**options), limit=1000)
+    assert on_disk.rate.chunks is not None
+    assert on_disk.time.chunks is not None
+    xr.testing.assert_identical(on_disk.compute().drop_attrs(), in_memory.drop_attrs())
+
+
+def test_without_a_time_column_the_rate_is_asked_for_and_kept(tmp_path: Path) -> None:
+    path = tmp_path / "ch.mat"
+    savemat(path, {"gyro": np.ones((50, 3))})
+    mapping = {f"gyro/{i}": f"gyro_{axis} [deg/h]" for i, axis in enumerate("xyz")}
+    with pytest.raises(OptionError, match="--rate HZ"):
+        read_log(path, map=mapping)
+    raw = read_log(path, map=mapping, rate=100.0, start="2026-01-01T00:00:00")
+    assert "time" not in raw.variables
+    assert (raw.attrs["declared_rate_hz"], raw.attrs["start"]) == (100.0, "2026-01-01T00:00:00")
+
+
+def test_float32_rates_convert_in_float64(tmp_path: Path) -> None:
+    values = np.linspace(-1, 1, 40, dtype=np.float32)
+    path = tmp_path / "single.parquet"
+    parquet.write_table(pa.table({"gyro_x [rad/s]": values}), path)
+    raw = read_log(path, rate=10)
+    np.testing.assert_allclose(raw.rate[0], np.rad2deg(values.astype(np.float64)) * 3600, rtol=1e-14)
+
+
+def test_parquet_dates_and_field_units(tmp_path: Path) -> None:
+    stamps = np.datetime64("2026-01-01T00:00:00.000000001", "ns") + np.arange(5) * np.timedelta64(10_000_000, "ns")
+    field = pa.field("gyro_z", pa.int16(), metadata={"units": "deg/h"})
+    schema = pa.schema([pa.field("Time", pa.timestamp("ns", tz="UTC")), field])
+    path = tmp_path / "dates.parquet"
+    parquet.write_table(pa.Table.from_arrays([pa.array(stamps), pa.array([1, None, 3, 4, 5], pa.int16())], schema=schema), path)
+    raw = read_log(path)
+    np.testing.assert_array_equal(raw.time, stamps)
+    np.testing.assert_array_equal(raw.rate[0], [1, np.nan, 3, 4, 5])
+    assert raw.attrs["unreadable_cells"] == 1
+
+
+def test_float32_stamps_are_pointed_out(tmp_path: Path) -> None:
+    path = tmp_path / "single.parquet"
+    parquet.write_table(pa.table({"time [s]": np.arange(5, dtype=np.float32), "gyro_x [deg/h]": np.ones(5)}), path)
+    assert "float32" in " ".join(read_log(path).attrs["notes"])
+
+
+def test_netcdf_attribute_units_give_way_to_the_option(tmp_path: Path) -> None:
+    path = tmp_path / "counts.nc"
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("time", 4)
+        variable = file.createVariable("BJZ", "i4", ("time",))
+        variable.units = "counts"
+        variable[:] = [1, 2, 3, 4]
+    with pytest.raises(Exception, match=r"'counts', which is a unit of number, not of rate.*--unit"):
+        read_log(path, rate=20, map={"BJZ": "gyro_z"})
+    raw = read_log(path, rate=20, map={"BJZ": "gyro_z"}, unit={"gyro": "0.5 deg/h"})
+    np.testing.assert_array_equal(raw.rate[0], [0.5, 1.0, 1.5, 2.0])
+
+
+def test_masked_netcdf_cells_are_missing(tmp_path: Path) -> None:
+    path = tmp_path / "packed.nc"
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("n", 4)
+        time = file.createVariable("time", "i8", ("n",), fill_value=-1)
+        time.units = "milliseconds since 2026-01-01"
+        time[:] = [0, 10, -1, 30]
+        gyro = file.createVariable("gyro_x", "i2", ("n",), fill_value=-9999)
+        gyro.setncatts({"units": "degree hour-1", "scale_factor": 0.25})
+        gyro.set_auto_maskandscale(False)
+        gyro[:] = [4, -9999, 8, 12]
+    raw = read_log(path)
+    np.testing.assert_array_equal(raw.rate[0], [1.0, np.nan, 2.0, 3.0])
+    assert np.isnat(raw.time.values).tolist() == [False, False, True, False]
+    assert raw.time.values[3] == np.datetime64("2026-01-01T00:00:00.030")
+    assert raw.attrs["unreadable_rows"] == 2
+
+
+@pytest.mark.parametrize("name", ["cut.parquet", "cut.nc", "cut.mat"])
+def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
+    whole = tmp_path / f"whole{Path(name).suffix}"
+    {".parquet": as_parquet, ".nc": as_netcdf, ".mat": as_mat73}[whole.suffix](whole)
+    cut = tmp_path / name
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    with pytest.raises(FormatError, match=rf"{name}.*copy it again"):
+        read_log(cut)
+
+
+def test_a_matlab_file_of_words_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "words.mat"
+    savemat(path, {"note": "hello", "scalar": 4.0})
+    with pytest.raises(FormatError, match="no vector or matrix"):
+        read_log(path)
+
+
+def test_shorter_matlab_vectors_are_left_out_with_a_note(tmp_path: Path) -> None:
+    path = tmp_path / "two.mat"
+    savemat(path, {"gyro_x": np.ones(30), "slow": np.ones(3)})
+    raw = read_log(path, rate=1, unit={"gyro": "deg/h"})
+    assert any("slow" in note and "30 rows" in note for note in raw.attrs["notes"])
+    with pytest.raises(MissingUnitError, match="--unit gyro=deg/s"):
+        read_log(path, rate=1)
+
+
+def test_buffers_spill_and_park() -> None:
+    rng = np.random.default_rng(0)
+    blocks = [{"a": rng.normal(size=n), "b": np.arange(n)} for n in (5, 1, 30, 7)]
+    expected = {key: np.concatenate([block[key] for block in blocks]) for key in "ab"}
+    for limit in (0, 200, 10**6):
+        buffers = Buffers({"a": np.float64, "b": np.int64}, limit=limit)
+        for block in blocks:
+            buffers.add(block)
+        found = buffers.finish()
+        assert isinstance(found["a"], np.memmap) == (limit < 10**6)
+        for key in "ab":
+            np.testing.assert_array_equal(np.asarray(lazily(found[key])), expected[key])
+    matrix = rng.normal(size=(3, 40))
+    np.testing.assert_array_equal(park(matrix).compute(), matrix)
