@@ -33,7 +33,7 @@ LOOK = 64
 _ORDER = 16  # rows within which an out-of-order row is followed by one past the latest stamp
 
 # what happened to a row, numbered as in schema.GAP_CAUSES
-DUPLICATE, OUT_OF_ORDER, STEP, RESTART = 2, 3, 5, 6
+_ON_TIME, _BY_COUNT, DUPLICATE, OUT_OF_ORDER, STEP, RESTART = 0, 1, 2, 3, 5, 6
 
 # places in the state: integers and stamps
 _HEAD, _ROW, _RUN_GRID, _RUN_ROW, _RUN_LENGTH, _PENDING, _PENDING_ROW, _GRID0, _STAMP0, _LATEST, FIRST, STARTED = range(12)
@@ -43,7 +43,7 @@ _RING = 1 << 14
 
 
 def new_state() -> tuple[np.ndarray, np.ndarray]:
-    """What `place` remembers between two blocks: counters, and which of the last samples are taken."""
+    """Make what `place` remembers between two blocks: counters, and which of the last samples are taken."""
     return np.zeros(12, dtype=np.int64), np.zeros(_RING, dtype=np.bool_)
 
 
@@ -144,6 +144,68 @@ def _occupy(ring, head, sample):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
+def _is_free(ring, state, target):  # type: ignore[no-untyped-def]
+    """Whether a sample before the head, of the same piece and not too long ago, has no row yet."""
+    lowest = max(state[_GRID0], state[_HEAD] - len(ring) + 1)
+    return lowest <= target <= state[_HEAD] and not ring[target % len(ring)]
+
+
+@njit(nogil=True, cache=True)
+def _settle(row, position, hold, state, ring):  # type: ignore[no-untyped-def]
+    """Place the rows without a stamp that come just before `row`, if it leaves exactly their room."""
+    pending = state[_PENDING]
+    state[_PENDING] = 0
+    if pending > 0 and state[_ROW] + 1 + pending == row and abs(position - (state[_HEAD] + 1 + pending)) <= hold:
+        for sample in range(state[_HEAD] + 1, state[_HEAD] + 1 + pending):
+            _occupy(ring, sample - 1, sample)
+        state[_RUN_LENGTH] += pending
+        state[_ROW] += pending
+        state[_HEAD] += pending
+
+
+@njit(nogil=True, cache=True)
+def _ahead(stamps, j, position, period, max_gap, state):  # type: ignore[no-untyped-def]
+    """Judge row j, whose stamp is later than the next sample: verdict and sample."""
+    expected = state[_HEAD] + 1
+    soon = position - expected < 1.5
+    # a late stamp stands apart from the one after it; of a doubled row, which follows a missing one, both are the same
+    apart = j + 1 < len(stamps) and stamps[j + 1] > stamps[j] + 0.05 * period
+    if (apart or not soon) and _fits(stamps, j, len(stamps), expected, state[_STAMP0], state[_GRID0], period, 2):
+        return _BY_COUNT, expected
+    if (stamps[j] - state[_LATEST]) / period > max_gap:
+        return STEP, expected + 1
+    return _ON_TIME, np.int64(np.rint(position))
+
+
+@njit(nogil=True, cache=True)
+def _behind(stamps, j, position, period, state, ring):  # type: ignore[no-untyped-def]
+    """Judge row j, whose stamp is earlier than the next sample: verdict and sample."""
+    expected = state[_HEAD] + 1
+    target = np.int64(np.rint(position))
+    if _persists(stamps, j, len(stamps), state[_LATEST]):
+        elapsed = state[_LATEST] - state[_STAMP0]
+        begins_again = stamps[j] <= state[FIRST] + 0.1 * elapsed or 2 * (state[_LATEST] - stamps[j]) > elapsed
+        return RESTART if begins_again else STEP, expected + 1
+    if _is_free(ring, state, target):
+        return OUT_OF_ORDER, target
+    stray = position - expected < -2.5
+    if stray and _fits(stamps, j, len(stamps), expected, state[_STAMP0], state[_GRID0], period, 2):
+        return _BY_COUNT, expected
+    return DUPLICATE if target >= state[_HEAD] else OUT_OF_ORDER, max(target, state[_GRID0])
+
+
+@njit(nogil=True, cache=True)
+def _judge(stamps, j, position, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
+    """Judge row j, whose stamp lies at `position` on the grid: verdict and sample."""
+    expected = state[_HEAD] + 1
+    if position - expected > hold:
+        return _ahead(stamps, j, position, period, max_gap, state)
+    if position - expected < -hold:
+        return _behind(stamps, j, position, period, state, ring)
+    return _ON_TIME, expected
+
+
+@njit(nogil=True, cache=True)
 def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
     """Give rows their samples.
 
@@ -175,7 +237,6 @@ def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[
     runs = np.empty((2 * n + 2, 3), dtype=np.int64)
     events = np.empty((2 * n + 2, 5), dtype=np.int64)
     n_runs = n_events = 0
-    size = len(ring)
     for j in range(n):
         row, stamp = rows[j], stamps[j]
         if stamp == NO_STAMP:
@@ -190,56 +251,22 @@ def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[
             state[_RUN_LENGTH] = 1
             ring[0] = True
             continue
-        head = state[_HEAD]
-        expected = head + 1
         position = state[_GRID0] + (stamp - state[_STAMP0]) / period
-        pending = state[_PENDING]
-        state[_PENDING] = 0
-        if pending > 0 and state[_ROW] + 1 + pending == row and abs(position - (expected + pending)) <= hold:
-            for g in range(expected, expected + pending):
-                _occupy(ring, g - 1, g)
-            state[_RUN_LENGTH] += pending
-            state[_ROW] += pending
-            state[_HEAD] = head = head + pending
-            expected = head + 1
-        deviation = position - expected
-        target = expected
-        trusted = True  # whether the stamp says where the row belongs
-        if abs(deviation) > hold:
-            target = np.int64(np.rint(position))
-            if deviation > 0:
-                late = deviation < 1.5 and j + 1 < len(stamps) and stamps[j + 1] > stamp + 0.05 * period
-                if (late or deviation >= 1.5) and _fits(stamps, j, len(stamps), expected, state[_STAMP0], state[_GRID0], period, 2):
-                    target, trusted = expected, False
-                elif (stamp - state[_LATEST]) / period > max_gap:
-                    events[n_events] = (STEP, head + 1, row, state[_LATEST], stamp)
-                    n_events += 1
-                    target = head + 2
-                    state[_GRID0], state[_STAMP0] = target, _origin(stamps, j, period)
-            else:
-                free = target > head - size and target >= 0 and not ring[target % size]
-                if _persists(stamps, j, len(stamps), state[_LATEST]):
-                    elapsed = state[_LATEST] - state[_STAMP0]
-                    back = state[_LATEST] - stamp
-                    cause = RESTART if (stamp <= state[FIRST] + 0.1 * elapsed or 2 * back > elapsed) else STEP
-                    events[n_events] = (cause, head + 1, row, state[_LATEST], stamp)
-                    n_events += 1
-                    target = head + 2
-                    state[_GRID0], state[_STAMP0], state[_LATEST] = target, _origin(stamps, j, period), stamp
-                elif free and target >= state[_GRID0] and target <= head:
-                    events[n_events] = (OUT_OF_ORDER, target, row, state[_LATEST], stamp)
-                    n_events += 1
-                    ring[target % size] = True
-                    runs[n_runs] = (target, row, 1)
-                    n_runs += 1
-                    continue
-                elif deviation < -2.5 and _fits(stamps, j, len(stamps), expected, state[_STAMP0], state[_GRID0], period, 2):
-                    target, trusted = expected, False
-                else:
-                    cause = DUPLICATE if target >= head else OUT_OF_ORDER
-                    events[n_events] = (cause, max(target, state[_GRID0]), row, state[_LATEST], stamp)
-                    n_events += 1
-                    continue
+        _settle(row, position, hold, state, ring)
+        head = state[_HEAD]
+        verdict, target = _judge(stamps, j, position, period, hold, max_gap, state, ring)
+        if verdict > _BY_COUNT:
+            events[n_events] = (verdict, head + 1 if verdict >= STEP else target, row, state[_LATEST], stamp)
+            n_events += 1
+        if verdict >= STEP:
+            state[_GRID0], state[_STAMP0], state[_LATEST] = target, _origin(stamps, j, period), stamp
+        elif verdict == OUT_OF_ORDER and _is_free(ring, state, target):
+            ring[target % len(ring)] = True
+            runs[n_runs] = (target, row, 1)
+            n_runs += 1
+            continue
+        elif verdict > _BY_COUNT:
+            continue
         if target == head + 1 and row == state[_ROW] + 1:
             state[_RUN_LENGTH] += 1
         else:
@@ -248,6 +275,6 @@ def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[
             state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH] = target, row, 1
         _occupy(ring, head, target)
         state[_HEAD], state[_ROW] = target, row
-        if trusted:
+        if verdict != _BY_COUNT:
             state[_LATEST] = max(state[_LATEST], stamp)
     return runs[:n_runs].copy(), events[:n_events].copy()

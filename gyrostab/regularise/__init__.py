@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import xarray as xr
 
@@ -76,6 +75,7 @@ def _place(
         return place_without_time(found.rows, _start(raw, notes)), declared
     everything = found.absent <= 0.01 * found.rows  # single unreadable rows took their time all the same
     stamps: Stamps = partial(blocks, raw, found, block=block)
+    counted: Stamps = partial(blocks, raw, found, block=block, all_rows=everything)
     try:
         estimate = estimate_rate(stamps, where=where)
     except TimeError:
@@ -86,12 +86,12 @@ def _place(
     if declared is not None:
         if abs(declared / estimate.raw - 1) > _DISAGREE:
             raise TimeError(
-                f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz; leave out --rate to "
-                "use the stamps, or correct --rate, --epoch or the unit of the time column"
+                f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz; "
+                "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of the time column"
             )
         rate = declared
     if estimate.counted:
-        placement = place_by_count(partial(stamps, all_rows=everything), estimate, rate, max_gap=max_gap)
+        placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
         odd = []
     else:
         placement = place_by_stamp(stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where)
@@ -176,6 +176,7 @@ def regularise(
 
     Examples
     --------
+    >>> import numpy as np
     >>> time = np.array([0, 10, 20, 50, 60], dtype="datetime64[ms]").astype("datetime64[ns]")
     >>> values = ("axis", "row"), np.array([[1.0, 2.0, 3.0, 6.0, 7.0]]), {"units": "degree hour-1"}
     >>> log = regularise(xr.Dataset({"rate": values}, {"axis": ["z"], "time": ("row", time)}))

@@ -30,7 +30,7 @@ def _fill(rows: NDArray[Any], *, runs: NDArray[np.int64], size: int, scale: floa
 
 
 def _cut(runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int) -> NDArray[np.int64]:
-    """The parts of the runs that lie in the samples from `begin` to `end`."""
+    """Cut out the parts of the runs that lie in the samples from `begin` to `end`."""
     part = runs[np.searchsorted(ends, begin, side="right") : np.searchsorted(runs[:, 0], end, side="left")]
     first = np.maximum(part[:, 0], begin)
     last = np.minimum(part[:, 0] + part[:, 2], end)
@@ -38,7 +38,7 @@ def _cut(runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int)
 
 
 def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0) -> Any:
-    """An array by row as an array by sample, float64, NaN where there is no row and where a value is infinite.
+    """Turn an array by row into an array by sample, float64, NaN where there is no row and where a value is infinite.
 
     Parameters
     ----------

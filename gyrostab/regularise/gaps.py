@@ -87,7 +87,7 @@ def _thinned(table: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 def find_gaps(placement: Placement, found: Survey, *, most: int = MOST_GAPS) -> NDArray[np.int64]:
-    """The table of gaps in samples.
+    """Make the table of gaps, in samples.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str
 
 
 def gap_table(log: xr.Dataset) -> pd.DataFrame:
-    """The gaps of a regular log as a table.
+    """List the gaps of a regular log.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ _NAMED = 5  # of many events of one kind, so many are told one by one
 
 
 def duration(seconds: float) -> str:
-    """A duration as people say it.
+    """Write a duration as people say it.
 
     Examples
     --------
@@ -44,12 +44,12 @@ def describe_rate(
         notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
     off = abs(estimate.raw / rate - 1)
     if off * placement.size > 1 and off > 2 * estimate.stderr / rate:
-        notes.append(f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million from the {rate:.10g} Hz used")
+        notes.append(f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million from {rate:.10g} Hz")
     for row, stamp, own in odd[:_NAMED]:
         file, local = file_of(raw, row)
         notes.append(
-            f"{file}: from {stamp_text(stamp)} (row {local}) the samples come at {own:.6g} Hz and not at {rate:.6g} Hz; they are placed by their "
-            "stamps, so samples are missing or dropped there; split the log at that row and run the parts one by one"
+            f"{file}: from {stamp_text(stamp)} (row {local}) the samples come at {own:.6g} Hz and not at {rate:.6g} Hz; "
+            "by their stamps samples are missing or dropped there; split the log at that row and run the parts on their own"
         )
     return notes
 
@@ -63,8 +63,9 @@ def _breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
         way = "back" if jump < 0 else "ahead"
         what = "time restarts" if cause == RESTART else "the clock steps"
         notes.append(
-            f"{file}: {what} at row {local}: from {stamp_text(before)} to {stamp_text(after)}, {duration(abs(jump))} {way}; the pause is of unknown "
-            "length, so the rows that follow come after one missing sample" + ("" if jump < 0 else "; if the pause is real, raise max_gap")
+            f"{file}: {what} at row {local}: from {stamp_text(before)} to {stamp_text(after)}, {duration(abs(jump))} {way}; "
+            "the pause is of unknown length, so the rows that follow come after one missing sample"
+            + ("" if jump < 0 else "; if the pause is real, raise max_gap")
         )
     if len(events) > _NAMED:
         notes.append(f"{file_of(raw)[0]}: {len(events) - _NAMED} more restarts and steps of the clock are in the table of gaps")
@@ -89,7 +90,8 @@ def _missing(raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], ra
         total = int(holes[:, 2].sum())
         share = total / placement.size
         notes.append(
-            f"{file_of(raw)[0]}: {total} samples ({duration(total / rate)}, {share:.2g} of the log) are missing in {len(holes)} places; all are in the table of gaps"
+            f"{file_of(raw)[0]}: {total} samples ({duration(total / rate)}, {share:.2g} of the log) are missing in {len(holes)} places; "
+            "all are in the table of gaps"
         )
     return notes
 
@@ -108,7 +110,8 @@ def describe(raw: xr.Dataset, found: Survey, placement: Placement, table: NDArra
         kept = int((samples_of(placement, late[:, 2]) >= 0).sum())
         file, local = file_of(raw, int(late[:, 2].min()))
         notes.append(
-            f"{file}: {len(late)} rows are out of order, the first is row {local}; {kept} were put in their place, {len(late) - kept} dropped"
+            f"{file}: {len(late)} rows are out of order, the first is row {local}; "
+            f"{kept} were put in their place, {len(late) - kept} dropped"
         )
     lost = found.rows - found.absent - placement.placed - len(twice) - (len(late) - kept if len(late) else 0)
     if lost > 0:

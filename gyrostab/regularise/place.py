@@ -133,14 +133,16 @@ def _windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
     parts: list[tuple[NDArray[np.float64], ...]] = []
     rest = np.empty(0, dtype=np.int64)
     first: int | None = None
+    last: list[float] = []  # of the window before
     done = 0
 
-    def summarise(values: NDArray[np.int64], before: int) -> None:
+    def summarise(values: NDArray[np.int64], before: int, zero: int) -> None:
         table = values.reshape(-1, width) if len(values) >= width else values[None]
-        ahead = (table - first) / period - (np.arange(values.size) + before).reshape(table.shape)
+        ahead = (table - zero) / period - (np.arange(values.size) + before).reshape(table.shape)
         ahead[table == NO_STAMP] = np.nan
         known = np.where(np.isnan(ahead), np.nanmedian(ahead) if np.isfinite(ahead).any() else 0.0, ahead)
-        step = np.diff(known, axis=1, prepend=known[:, :1])
+        step = np.diff(known.ravel(), prepend=last[0] if last else known[0, 0]).reshape(known.shape)
+        last[:] = [known[-1, -1]]
         at = np.arange(len(table)) * width + before
         low, high = known.min(axis=1), known.max(axis=1)
         parts.append((low, high, np.quantile(known, 0.9, axis=1) - low, at + step.argmax(axis=1), at + step.argmin(axis=1)))
@@ -151,10 +153,10 @@ def _windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
             first = int(rest[rest != NO_STAMP][0])
         n = len(rest) // width * width
         if n and first is not None:
-            summarise(rest[:n], done)
+            summarise(rest[:n], done, first)
             rest, done = rest[n:], done + n
     if first is not None and (len(rest) >= width // 2 or not parts) and len(rest):
-        summarise(rest, done)
+        summarise(rest, done, first)
     low, high, reach, up, down = (np.concatenate(column) for column in zip(*parts, strict=True))
     return _Windows(low, high, reach, up.astype(np.int64), down.astype(np.int64)), int(first or 0)
 
@@ -238,7 +240,7 @@ def _rows_at(stamps: Stamps, counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _counted_runs(stamps: Stamps, cuts: NDArray[np.int64], shifts: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Runs of rows by count, where from count ``cuts[i]`` on the sample is the count plus ``shifts[i]``."""
+    """Make runs of rows by count, where from count ``cuts[i]`` on the sample is the count plus ``shifts[i]``."""
     runs: list[NDArray[np.int64]] = []
     done = 0
     for rows, _ in stamps():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ SECOND = 1e9
 #: Gives the blocks of row numbers and stamps, from the first on, as often as asked.
 Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 _GAIN = 0.1
-_SURE = 500.0  # samples over which the first estimate of the period may be trusted to count
+_SURE = 500.0  # samples over which the first estimate of the period of a long log is trusted to count
 _MAX_PIECES = 200_000
 
 
@@ -64,7 +65,8 @@ def _pools(stamps: Stamps, *, size: int = 8192, most: int = 64) -> list[NDArray[
 
 def _residual_range(parts: list[NDArray[np.int64]], length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slope [ns a row] and range of the residuals [ns] of straight lines through stretches of `length` stamps."""
-    cut = [part[: len(part) // length * length].reshape(-1, length) for part in parts]
+    stride = length if sum(map(len, parts)) > 200 * length else 1  # of a short log, every stretch
+    cut = [np.lib.stride_tricks.sliding_window_view(part, length)[::stride] for part in parts if len(part) >= length]
     table = np.concatenate([*cut, np.empty((0, length), dtype=np.int64)])
     values = (table - table[:, :1]).astype(np.float64)
     x = np.arange(length) - (length - 1) / 2
@@ -97,12 +99,18 @@ def _refined(steps: NDArray[np.float64], period: float) -> float:
     return period
 
 
+def _misfit(steps: NDArray[np.float64], period: float) -> float:
+    """How far steps are from whole numbers of samples, root mean square [samples]; 0.29 says that they are anywhere."""
+    near = steps[np.abs(steps) < 5.5 * period] / period
+    return float(np.sqrt(np.mean((near - np.rint(near)) ** 2))) if len(near) else 0.5
+
+
 def _on_a_line(parts: list[NDArray[np.int64]]) -> float | None:
     """Period of the stretches in which the row count alone predicts the stamps to less than a sample."""
-    length = min(16, *(len(part) for part in parts))
+    length = min(16, max(len(part) for part in parts))
     slope, spread = _residual_range(parts, length)
     good = (slope > 0) & (spread < 0.95 * slope)
-    if length < 4 or good.sum() < max(1, 0.03 * len(slope)):
+    if length < 12 or good.sum() < max(1, 0.03 * len(slope)):
         return None
     period = float(np.median(slope[good]))
     for gain in (0.5, 0.5, 0.2, 0.1, _GAIN):
@@ -123,13 +131,29 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
     rising = steps[steps > 0]
     if _shared(parts, steps):
         return _throughput(parts, ticks=True), True, True
-    period = _on_a_line(parts) or _refined(steps, float(np.median(rising)))
+    period = _on_a_line(parts)
+    if period is None:
+        period = _refined(steps, float(np.median(rising)))
+        if _misfit(steps, period) > 0.2:  # with most rows missing, the median step is not one sample
+            shorter = _refined(steps, float(np.quantile(rising, 0.1)))
+            period = shorter if _misfit(steps, shorter) < 0.15 else period
+    return (_throughput(parts), True, False) if _bursty(parts, steps, period) else (period, False, False)
+
+
+def _bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
+    """Whether the long steps are pauses between bursts: they do not fit the lattice of the short ones, or make up for them."""
     long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
     near = steps[np.abs(steps) < 50 * period]
-    if len(long) > max(10, 0.02 * len(steps)) and near.sum() > 1.2 * period * len(near):
-        if abs(np.exp(2j * np.pi * long / period).mean()) < 0.2:
-            return _throughput(parts), True, False
-    return period, False, False
+    if len(long) <= max(10, 0.02 * len(steps)) or near.sum() <= 1.2 * period * len(near):
+        return False
+    if abs(np.exp(2j * np.pi * long / period).mean()) < 0.2:
+        return True
+    length = min(256, len(steps) // 16)
+    if np.median(long) < 3 * period or length < 16:
+        return False
+    spans = np.concatenate([(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]).astype(np.float64)
+    scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
+    return bool(scatter**2 < 0.2 * length * near.var())  # samples lost at random would add up
 
 
 def _throughput(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
@@ -172,7 +196,7 @@ def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest:
         if coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1:  # only there the true time is known
             block, count, piece = block[tick], count[tick], piece[tick]
         edges = np.concatenate([[0], np.flatnonzero(np.diff(piece)) + 1, [len(block)]])
-        for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for a, b in pairwise(edges):
             c, t = count[a:b].astype(np.float64), (block[a:b] - zero).astype(np.float64)
             mc, mt = c.mean(), t.mean()
             c, t = c - mc, t - mt
@@ -208,7 +232,7 @@ def _joined(pieces: NDArray[np.float64], period: float, error: float, noise: flo
         n, mc, mt, cc, ct = pieces[0, :5]
         for n2, mc2, mt2, cc2, ct2 in pieces[1:, :5]:
             apart = (mt2 - mt) / period
-            if apart > 0 and (apart * error + 3 * noise / np.sqrt(min(n, n2))) / period < 0.2:
+            if apart > 0 and (apart * error + 3 * noise / np.sqrt(min(n, n2))) / period < 0.35:
                 shift = np.rint(apart - (mc2 - mc)) + mc2 - mc  # distance of the mean counts
                 weight, share = n * n2 / (n + n2), n2 / (n + n2)
                 cc, ct = cc + cc2 + weight * shift**2, ct + ct2 + weight * shift * (mt2 - mt)
@@ -223,7 +247,7 @@ def _joined(pieces: NDArray[np.float64], period: float, error: float, noise: flo
 
 
 def _plain(rate: float, error: float, samples: float, counted: bool) -> float:
-    """A number that people would have chosen, when the estimate cannot tell it from itself."""
+    """Take a number that people would have chosen, when the estimate cannot tell it from itself."""
     room = error if counted else min(error, 0.5 * rate / max(samples, 1.0))
     candidates = [float(round(rate))] if rate > 0.5 else []
     period_ms = 1000.0 / rate
@@ -271,7 +295,8 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         what = "time runs backwards" if (steps < 0).any() else "all stamps are the same"
         raise TimeError(f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ")
     period, counted, coarse = starting_period(parts)
-    longest = _longest(parts, period) if counted else _SURE * period
+    sure = min(_SURE, max(5.0, len(steps) / 20))
+    longest = _longest(parts, period) if counted else sure * period
     pieces = _pieces(stamps, period, counted, coarse, longest)
     period, error, samples = _pooled(pieces, period, counted and not coarse)
     rate = SECOND / period

@@ -126,7 +126,7 @@ def _sources(raw: xr.Dataset) -> str:
 
 
 def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:
-    """The source file that a row of the raw log comes from, and the row's number in it, counted from 0."""
+    """Name the source file that a row of the raw log comes from, and the row's number in it, counted from 0."""
     names = raw.attrs.get("source_files") or ["the raw log"]
     names = [names] if isinstance(names, str) else list(names)
     starts = [int(start) for start in np.atleast_1d(raw.attrs.get("row_start", 0))]
@@ -137,5 +137,5 @@ def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:
 
 
 def stamp_text(stamp: int) -> str:
-    """A stamp [ns since 1970] as ISO 8601, to the millisecond."""
+    """Write a stamp [ns since 1970] as ISO 8601, to the millisecond."""
     return "no stamp" if stamp == NO_STAMP else str(np.datetime64(int(stamp), "ns").astype("datetime64[ms]"))

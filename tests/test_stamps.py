@@ -1,0 +1,131 @@
+"""The placement kernel, against samples that are known because the stamps were made from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gyrostab.kernels import stamps as kernel
+from gyrostab.kernels.stamps import DUPLICATE, NO_STAMP, OUT_OF_ORDER, RESTART, STEP
+
+PERIOD = 10_000_000.0
+
+
+def place(samples, *, max_gap=1e9, hold=0.75, pieces=None):
+    """Runs and events of rows with stamps at `samples` (may be fractions; None: no stamp)."""
+    stamps = np.array([NO_STAMP if s is None else round(s * PERIOD) for s in samples], dtype=np.int64)
+    rows = np.arange(len(stamps))
+    state, ring = kernel.new_state()
+    runs, events = [], []
+    edges = [0, *(pieces or []), len(rows)]
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        end = min(len(rows), b + kernel.LOOK)
+        run, event = kernel.place(rows[a:end], stamps[a:end], b - a, PERIOD, hold, max_gap, state, ring)
+        runs.append(run)
+        events.append(event)
+    runs.append(state[kernel.OPEN_RUN][None])
+    found = np.full(len(rows), -1)
+    for sample, row, length in np.concatenate(runs):
+        found[row : row + length] = np.arange(sample, sample + length)
+    return found.tolist(), np.concatenate(events)
+
+
+def test_unbroken_rows_are_one_run():
+    assert place(range(1000))[0] == list(range(1000))
+
+
+def test_missing_samples_are_left_out():
+    samples = [0, 1, 2, 6, 7, 8, 20, 21, 22, 23]
+    assert place(samples)[0] == samples
+
+
+def test_first_of_two_rows_of_one_sample_is_kept():
+    found, events = place([0, 1, 2, 2, 3, 4])
+    assert found == [0, 1, 2, -1, 3, 4]
+    assert events[:, [0, 1, 2]].tolist() == [[DUPLICATE, 2, 3]]
+
+
+def test_out_of_order_row_takes_its_free_sample():
+    found, events = place([0, 1, 2, 4, 3, 5, 6])
+    assert found == [0, 1, 2, 4, 3, 5, 6]
+    assert events[:, [0, 1, 2]].tolist() == [[OUT_OF_ORDER, 3, 4]]
+
+
+def test_out_of_order_row_without_a_free_sample_is_dropped():
+    found, events = place([0, 1, 2, 3, 1, 4, 5])
+    assert found == [0, 1, 2, 3, -1, 4, 5]
+    assert events[:, [0, 2]].tolist() == [[OUT_OF_ORDER, 4]]
+
+
+def test_one_damaged_stamp_does_not_move_its_row():
+    assert place([0, 1, 2, 9e5, 4, 5, 6])[0] == list(range(7))
+    assert place([500, 501, 502, 3, 504, 505, 506])[0] == list(range(7))
+
+
+def test_one_late_stamp_does_not_move_its_row():
+    assert place([0, 1, 2, 3.9, 4, 5, 6, 7])[0] == list(range(8))
+
+
+def test_rows_without_stamp_are_kept_where_they_fit_exactly():
+    assert place([0, 1, None, None, 4, 5])[0] == [0, 1, 2, 3, 4, 5]
+    assert place([0, 1, None, None, 5, 6])[0] == [0, 1, -1, -1, 5, 6]
+    assert place([None, 0, 1, 2, None])[0] == [-1, 0, 1, 2, -1]
+
+
+@pytest.mark.parametrize(("again", "cause"), [(0, RESTART), (30, RESTART), (75, STEP)])
+def test_time_set_back_appends_after_one_missing_sample(again, cause):
+    found, events = place([*range(100), *range(again, again + 50)], hold=0.75)
+    assert found == [*range(100), *range(101, 151)]
+    assert events.tolist() == [[cause, 100, 100, round(99 * PERIOD), round(again * PERIOD)]]
+
+
+def test_long_step_ahead_is_a_step_of_the_clock():
+    found, events = place([0, 1, 2, 1000, 1001, 1002], max_gap=500.0)
+    assert found == [0, 1, 2, 4, 5, 6]
+    assert events[0, 0] == STEP
+    assert place([0, 1, 2, 1000, 1001, 1002], max_gap=2000.0)[0] == [0, 1, 2, 1000, 1001, 1002]
+
+
+def test_jitter_of_the_first_stamp_does_not_shift_the_log():
+    random = np.random.default_rng(3)
+    samples = np.flatnonzero(random.random(3000) > 0.1)
+    samples -= samples[0]
+    jitter = random.uniform(-0.2, 0.2, len(samples))
+    jitter[0] = 0.2
+    assert place((samples + jitter).tolist())[0] == samples.tolist()
+
+
+def test_blocks_make_no_difference():
+    random = np.random.default_rng(7)
+    samples = np.sort(random.choice(4000, 3000, replace=False)).astype(float)
+    samples += random.uniform(-0.2, 0.2, len(samples))
+    swap = np.arange(100, 2900, 211)
+    samples[swap], samples[swap + 1] = samples[swap + 1], samples[swap]
+    values = [None if i % 97 == 5 else s for i, s in enumerate(samples.tolist())]
+    values = [*values, *(s for s in values[:500])]
+    whole, events = place(values)
+    for cuts in ([1], [700, 701, 702, 1500], list(range(13, 3500, 13))):
+        found, happened = place(values, pieces=cuts)
+        assert found == whole
+        assert happened.tolist() == events.tolist()
+
+
+def test_last_stamp_after_200_hours_at_300_hertz():
+    """Rows are 200 h apart in the kernel's arithmetic, so any accumulated error would show."""
+    period = 1e9 / 300
+    last = 200 * 3600 * 300
+    samples = np.concatenate([np.arange(1000), np.arange(last - 1000, last + 1)])
+    stamps = np.rint(samples * (1e9 / 300)).astype(np.int64)
+    state, ring = kernel.new_state()
+    runs, _ = kernel.place(np.arange(len(samples)), stamps, len(samples), period, 0.75, 1e12, state, ring)
+    assert runs.tolist() == [[0, 0, 1000]]
+    assert state[kernel.OPEN_RUN].tolist() == [last - 1000, 1000, 1001]
+
+
+def test_count_along_a_lattice_survives_jitter_and_a_wrong_period():
+    random = np.random.default_rng(1)
+    samples = np.flatnonzero(random.random(20_000) > 0.1)
+    stamps = np.rint((samples + random.uniform(-0.2, 0.2, len(samples))) * PERIOD).astype(np.int64)
+    count, piece = kernel.track(stamps, PERIOD * 1.002, 0.1, 500 * PERIOD)
+    assert piece.max() == 0
+    assert count[-1] == samples[-1] - samples[0]
