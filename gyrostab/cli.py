@@ -266,8 +266,9 @@ def run(
 ) -> None:
     """Go the whole way from logs to the product: uniform time, dynamic Allan variance, noise coefficients, NetCDF.
 
-    The log may be larger than the memory. Example:
-    gyrostab run run7/*.csv -o product.nc --window 10min --step 1min
+    The log may be larger than the memory.
+
+    Example: gyrostab run run7/*.csv -o product.nc --window 10min --step 1min
 
     Parameters
     ----------
