@@ -164,7 +164,7 @@ def _covariance(squares, to_samples, white, quantization, factor, pairs, ramps, 
                 total += ramp * amplitude * ramps[a, p, q]
                 for b in range(4):
                     total += amplitude * root[b, i] * root[b, j] * pairs[a, b, p, q]
-            total /= np.sqrt(factor[p] * factor[q])
+            total /= max(factor[p], factor[q])  # the poorer cell uses a part of what the richer one uses
             out[i, j] = total
             out[j, i] = total
 
@@ -330,6 +330,25 @@ def _term(a, chosen, normal, right, whitened, factor, squares, spread, result): 
 
 
 @njit(nogil=True, cache=True)
+def _without(a, squares, design, trial):  # type: ignore[no-untyped-def]
+    """The noise if term `a` were not there and the neighbour most like it had made the same Allan variance instead.
+
+    A ramp or a flicker floor is claimed only against a random walk that would reach as high at the longest averaging
+    time, quantization against angle random walk at the shortest.
+    """
+    for b in range(squares.size):
+        trial[b] = squares[b]
+    trial[a] = 0.0
+    cell, stand_in = design.shape[0] - 1, -1
+    if a == 0:
+        cell, stand_in = 0, 1
+    elif a == 2 or a == 4:
+        stand_in = 3
+    if stand_in >= 0:
+        trial[stand_in] += squares[a] * design[cell, a] / design[cell, stand_in]
+
+
+@njit(nogil=True, cache=True)
 def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, ramps, weight, allowed, result):  # type: ignore[no-untyped-def]
     """Fit one window; returns chi-square, degrees of freedom and the number of usable cells (arguments as `fit_windows`)."""
     index = np.empty(y.size, np.int64)
@@ -368,13 +387,12 @@ def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, r
         if not allowed >> a & 1:
             continue
         used += chosen >> a & 1
-        trial[:] = squares
-        trial[a] = 0.0
+        _without(a, squares, design, trial)
         _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[0])
         trial[:] = 0.0
         trial[a] = 1.0
         _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[2])
-        trial[:] = squares
+        _without(a, squares, design, trial)
         trial[a] = 1.0
         _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[1])
         for i in range(n):

@@ -38,7 +38,7 @@ def reference_theta(
     theta : float64 (n or n + 1,)
         The integral of the rate in sample units; missing rates add nothing.
     present : bool (n or n + 1,)
-        Whether the angle is given (angles), or the sample that ends there (rates).
+        Whether the angle is given (angles), or, in the paper's convention, the sample that ends there (rates).
     missing : int64 (n or n + 1,)
         Missing rate samples before the angle; zeros for angles.
     """
@@ -50,7 +50,7 @@ def reference_theta(
     missing = np.cumsum(~here)
     if paper:
         return theta, here, missing
-    return np.concatenate(([0.0], theta)), np.concatenate(([True], here)), np.concatenate(([0], missing))
+    return np.concatenate(([0.0], theta)), np.ones(theta.size + 1, dtype=np.bool_), np.concatenate(([0], missing))
 
 
 def direct_sums(

@@ -36,15 +36,17 @@ _ORDER = 16  # rows within which an out-of-order row is followed by one past the
 _ON_TIME, _BY_COUNT, DUPLICATE, OUT_OF_ORDER, STEP, RESTART = 0, 1, 2, 3, 5, 6
 
 # places in the state: integers and stamps
-_HEAD, _ROW, _RUN_GRID, _RUN_ROW, _RUN_LENGTH, _PENDING, _PENDING_ROW, _GRID0, _STAMP0, _LATEST, FIRST, STARTED = range(12)
+_HEAD, _ROW, _RUN_GRID, _RUN_ROW, _RUN_LENGTH, _PENDING, _PENDING_ROW, _GRID0, _STAMP0, _LATEST, FIRST, STARTED, _PHASE = range(13)
 #: Where the state keeps the run that is still open: first sample, first row, length.
 OPEN_RUN = slice(_RUN_GRID, _RUN_LENGTH + 1)
 _RING = 1 << 14
+_GAIN = 0.05  # of the phase: it follows the clock's course and not the jitter of single stamps
+_UNIT = 1e-9  # samples, of the phase in the state
 
 
 def new_state() -> tuple[np.ndarray, np.ndarray]:
     """Make what `place` remembers between two blocks: counters, and which of the last samples are taken."""
-    return np.zeros(12, dtype=np.int64), np.zeros(_RING, dtype=np.bool_)
+    return np.zeros(13, dtype=np.int64), np.zeros(_RING, dtype=np.bool_)
 
 
 @njit(nogil=True, cache=True)
@@ -90,18 +92,18 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _fits(stamps, j, n, expected, origin, grid0, period, wanted):  # type: ignore[no-untyped-def]
+def _fits(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
     """Whether the next readable stamps after row j lie where unbroken counting puts them, after `expected`."""
     found = 0
-    last = min(n, j + 1 + LOOK)
-    for m in range(j + 1, last):
+    zero = state[_GRID0] - state[_PHASE] * _UNIT
+    for m in range(j + 1, min(len(stamps), j + 1 + LOOK)):
         if stamps[m] == NO_STAMP:
             continue
-        position = grid0 + (stamps[m] - origin) / period
+        position = zero + (stamps[m] - state[_STAMP0]) / period
         if abs(position - (expected + (m - j))) > 0.5:
             return False
         found += 1
-        if found == wanted:
+        if found == 2:
             return True
     return False
 
@@ -151,11 +153,11 @@ def _is_free(ring, state, target):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _settle(row, position, hold, state, ring):  # type: ignore[no-untyped-def]
+def _settle(row, position, state, ring):  # type: ignore[no-untyped-def]
     """Place the rows without a stamp that come just before `row`, if it leaves exactly their room."""
     pending = state[_PENDING]
     state[_PENDING] = 0
-    if pending > 0 and state[_ROW] + 1 + pending == row and abs(position - (state[_HEAD] + 1 + pending)) <= hold:
+    if pending > 0 and state[_ROW] + 1 + pending == row and abs(position - (state[_HEAD] + 1 + pending)) <= 0.5:
         for sample in range(state[_HEAD] + 1, state[_HEAD] + 1 + pending):
             _occupy(ring, sample - 1, sample)
         state[_RUN_LENGTH] += pending
@@ -170,7 +172,7 @@ def _ahead(stamps, j, position, period, max_gap, state):  # type: ignore[no-unty
     soon = position - expected < 1.5
     # a late stamp stands apart from the one after it; of a doubled row, which follows a missing one, both are the same
     apart = j + 1 < len(stamps) and stamps[j + 1] > stamps[j] + 0.05 * period
-    if (apart or not soon) and _fits(stamps, j, len(stamps), expected, state[_STAMP0], state[_GRID0], period, 2):
+    if (apart or not soon) and _fits(stamps, j, expected, period, state):
         return _BY_COUNT, expected
     if (stamps[j] - state[_LATEST]) / period > max_gap:
         return STEP, expected + 1
@@ -189,7 +191,7 @@ def _behind(stamps, j, position, period, state, ring):  # type: ignore[no-untype
     if _is_free(ring, state, target):
         return OUT_OF_ORDER, target
     stray = position - expected < -2.5
-    if stray and _fits(stamps, j, len(stamps), expected, state[_STAMP0], state[_GRID0], period, 2):
+    if stray and _fits(stamps, j, expected, period, state):
         return _BY_COUNT, expected
     return DUPLICATE if target >= state[_HEAD] else OUT_OF_ORDER, max(target, state[_GRID0])
 
@@ -198,10 +200,18 @@ def _behind(stamps, j, position, period, state, ring):  # type: ignore[no-untype
 def _judge(stamps, j, position, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
     """Judge row j, whose stamp lies at `position` on the grid: verdict and sample."""
     expected = state[_HEAD] + 1
-    if position - expected > hold:
+    phase = state[_PHASE] * _UNIT
+    if position - expected > 0.5:
         return _ahead(stamps, j, position, period, max_gap, state)
-    if position - expected < -hold:
+    if position - expected < -0.5:
         return _behind(stamps, j, position, period, state, ring)
+    if phase > hold:  # the clock has come to lie nearer to the sample after
+        state[_PHASE] -= int(1 / _UNIT)
+        return _ON_TIME, expected + 1
+    if phase < -hold:
+        state[_PHASE] += int(1 / _UNIT)
+        return DUPLICATE, expected - 1
+    state[_PHASE] += int(_GAIN * (position - expected) / _UNIT)
     return _ON_TIME, expected
 
 
@@ -209,8 +219,10 @@ def _judge(stamps, j, position, period, hold, max_gap, state, ring):  # type: ig
 def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
     """Give rows their samples.
 
-    The next row takes the next sample while its stamp is within `hold` of it; otherwise the sample is found anew from
-    the stamp, counted from the start of the piece, so nothing accumulates.
+    The next row takes the next sample while its stamp is within half a sample of it; otherwise the sample is found anew
+    from the stamp, counted from the start of the piece, so nothing accumulates. Stamps are seen from their own slow
+    course along the grid (the phase), so that jitter on top of a slightly wrong rate does not double or skip samples; only
+    when the course itself is more than `hold` off, one sample is left out, or one row.
 
     Parameters
     ----------
@@ -221,7 +233,7 @@ def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[
     period : float
         Sampling period [ns].
     hold : float
-        Tolerance [samples].
+        Tolerance of the phase [samples].
     max_gap : float
         A longer step ahead is a step of the clock [samples].
     state, ring : ndarray
@@ -251,15 +263,15 @@ def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[
             state[_RUN_LENGTH] = 1
             ring[0] = True
             continue
-        position = state[_GRID0] + (stamp - state[_STAMP0]) / period
-        _settle(row, position, hold, state, ring)
+        position = state[_GRID0] - state[_PHASE] * _UNIT + (stamp - state[_STAMP0]) / period
+        _settle(row, position, state, ring)
         head = state[_HEAD]
         verdict, target = _judge(stamps, j, position, period, hold, max_gap, state, ring)
         if verdict > _BY_COUNT:
             events[n_events] = (verdict, head + 1 if verdict >= STEP else target, row, state[_LATEST], stamp)
             n_events += 1
         if verdict >= STEP:
-            state[_GRID0], state[_STAMP0], state[_LATEST] = target, _origin(stamps, j, period), stamp
+            state[_GRID0], state[_STAMP0], state[_LATEST], state[_PHASE] = target, _origin(stamps, j, period), stamp, 0
         elif verdict == OUT_OF_ORDER and _is_free(ring, state, target):
             ring[target % len(ring)] = True
             runs[n_runs] = (target, row, 1)

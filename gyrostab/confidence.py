@@ -1,0 +1,68 @@
+"""Confidence intervals of the Allan variance from its equivalent degrees of freedom."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.schema import check_surface
+
+__all__ = ["confidence_interval"]
+
+
+def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Dataset:
+    """Interval that holds the true Allan variance of each cell.
+
+    ``edf * avar / true`` is taken as chi-square with ``edf`` degrees of freedom. Over gaps the true value is the law as
+    seen through them (``white_response``, ``quantization_response``).
+
+    Parameters
+    ----------
+    surface : xarray.Dataset
+        Surface or product with ``avar`` [degree2 hour-2] and ``edf``.
+    level : float
+        Probability, between 0 and 1.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``avar_lower, avar_upper (axis, time, tau)`` [degree2 hour-2]; NaN where there is no estimate; dask if `surface` is.
+
+    References
+    ----------
+    IEEE Std 1139-2008, annex; Greenhall and Riley, PTTI 2003.
+
+    Examples
+    --------
+    >>> from gyrostab.davar import davar
+    >>> from gyrostab.log import make_log
+    >>> noise = np.random.default_rng(1).standard_normal(6000)
+    >>> surface = davar(make_log(noise, rate=100.0, unit="deg/h"), window="60s", taus=[1.0])
+    >>> limits = confidence_interval(surface)
+    >>> bool((limits.avar_lower < 0.01) & (0.01 < limits.avar_upper))
+    True
+    """
+    check_surface(surface)
+    if not 0.0 < level < 1.0:
+        raise OptionError(f"level={level!r}: give a probability between 0 and 1, such as 0.95")
+    out = xr.Dataset()
+    for name, side, words in (("avar_lower", 0.5 + level / 2, "lower"), ("avar_upper", 0.5 - level / 2, "upper")):
+        limit = xr.apply_ufunc(
+            _limit, surface["avar"], surface["edf"], side, dask="parallelized", output_dtypes=[np.float64], keep_attrs=False
+        )
+        out[name] = limit.assign_attrs(
+            units=surface["avar"].attrs["units"], long_name=f"{words} end of the {level:.0%} interval of the Allan variance"
+        )
+    return out
+
+
+def _limit(avar: NDArray[np.float64], edf: NDArray[np.float64], side: float) -> Any:
+    from scipy.special import gammaincinv
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        quantile = 2.0 * gammaincinv(edf / 2.0, side)  # of chi-square
+        return np.where(edf > 0, edf * avar / quantile, np.nan)

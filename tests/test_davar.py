@@ -1,0 +1,338 @@
+"""The improved fast DAVAR against the definition, the published algorithms, allantools and its own invariances."""
+
+from __future__ import annotations
+
+import allantools
+import dask
+import dask.array as da
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab.davar import davar
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.log import make_log
+from gyrostab.schema import ESTIMATORS
+from tests.reference import cluster_variance, direct_angle_surface, direct_surface
+
+STRICT, WEIGHTED = ESTIMATORS.index("strict_runs"), ESTIMATORS.index("weighted_clusters")
+
+
+def log_of(x, rate=100.0, unit="deg/h", **options):
+    return make_log(x, rate=rate, unit=unit, **options)
+
+
+@st.composite
+def records(draw):
+    """Random records with offset, scale, random walk, gaps of several kinds, window, step and averaging factors."""
+    seed = draw(st.integers(0, 2**32 - 1))
+    rng = np.random.default_rng(seed)
+    n = draw(st.integers(40, 1500))
+    x = rng.standard_normal(n) * draw(st.sampled_from([1e-3, 1.0, 1e4])) + draw(st.sampled_from([0.0, -15.0, 1e5]))
+    x += draw(st.sampled_from([0.0, 0.1])) * np.cumsum(rng.standard_normal(n))
+    for _ in range(draw(st.integers(0, 5))):
+        start = int(rng.integers(0, n))
+        x[start : start + int(rng.integers(1, draw(st.sampled_from([2, 10, 400]))))] = np.nan
+    window = draw(st.integers(4, n))
+    step = draw(st.integers(1, window))
+    ks = sorted(draw(st.sets(st.integers(1, window // 2), min_size=1, max_size=6)))
+    return x, window, step, ks
+
+
+class TestAgainstTheDefinition:
+    @given(records())
+    @settings(max_examples=60, deadline=None)
+    def test_block_sums_equal_the_direct_sum(self, record):
+        x, window, step, ks = record
+        if (x.size - window) // step > 200:
+            x = x[: window + 200 * step]
+        result = davar(log_of(x), window=window, step=step, taus=[k / 100 for k in ks], min_strict=0.0, min_coverage=0.0)
+        avar, count = direct_surface(x, window, step, ks)
+        np.testing.assert_array_equal(result["count"].values[0], count)
+        # a cell whose few terms happen to be tiny is known to the rounding of the terms, not of their square
+        size = np.nanstd(x) if np.isfinite(x).sum() > 1 else 1.0
+        floor = 1e-12 * (size**2 / np.array(ks) ** 2 + np.nanmax(np.abs(x), initial=0.0) ** 2 * 1e-10)
+        got, want = result["avar"].values[0], avar
+        np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
+        assert np.all(np.abs(got - want)[count > 0] <= (1e-12 * want + floor)[count > 0])
+
+    @given(records())
+    @settings(max_examples=40, deadline=None)
+    def test_angle_records_use_every_triple_that_is_there(self, record):
+        x, window, step, ks = record
+        window = min(window, x.size - 1)
+        step, ks = min(step, window), [k for k in ks if 2 * k <= window] or [1]
+        if (x.size - 1 - window) // step > 200:
+            x = x[: window + 1 + 200 * step]
+        log = make_log(x / 3600, rate=100.0, unit="deg", kind="angle")
+        result = davar(log, window=window, step=step, taus=[k / 100 for k in ks], min_coverage=0.0)
+        avar, count = direct_angle_surface(x, window, step, ks, 0.01)
+        np.testing.assert_array_equal(result["count"].values[0], count)
+        floor = 1e-11 * np.nanmax(np.abs(x), initial=1.0) ** 2 * 1e4
+        np.testing.assert_allclose(result["avar"].values[0], avar, rtol=1e-9, atol=floor)
+
+    def test_thinned_terms_are_the_multiples_of_the_stride(self):
+        x = np.random.default_rng(2).standard_normal(9000)
+        x[3000:3040] = np.nan
+        result = davar(log_of(x), window=4000, step=700, taus=24, overlap="octave", min_strict=0.0)
+        ks = np.round(result.tau.values * 100).astype(int)
+        shifts = np.maximum(np.floor(np.log2(ks)).astype(int) - 3, 0)
+        assert np.all(ks % 2**shifts == 0)
+        assert shifts.max() > 3
+        avar, count = direct_surface(x, 4000, 700, list(ks), shifts=list(shifts))
+        np.testing.assert_array_equal(result["count"].values[0], count)
+        np.testing.assert_allclose(result["avar"].values[0], avar, rtol=1e-12)
+
+
+class TestAgainstPeers:
+    @pytest.mark.parametrize("window", [1000, 1003])
+    def test_agrees_with_allantools_in_every_window(self, window):
+        rng = np.random.default_rng(3)
+        x = 15.0 + rng.standard_normal(5000) + 0.05 * np.cumsum(rng.standard_normal(5000))
+        result = davar(log_of(x), window=window, step=500, taus="all", tau_max=4.0)
+        for j in (0, 3, result.sizes["time"] - 1):
+            part = x[j * 500 : j * 500 + window]
+            tau, deviation, _, n = allantools.oadev(part, rate=100.0, data_type="freq", taus=result.tau.values)
+            np.testing.assert_allclose(result.tau, tau, rtol=1e-12)
+            np.testing.assert_allclose(result.avar[0, j], deviation**2, rtol=1e-11)
+            np.testing.assert_array_equal(result["count"][0, j], n)
+
+    @pytest.mark.parametrize("method", ["direct", "recursive"])
+    def test_published_algorithms_agree_where_they_are_sound(self, method):
+        x = np.random.default_rng(4).standard_normal((2, 6000))
+        x[1, 2000:2300] = np.nan
+        log = log_of(x)
+        options = {"window": 1000, "step": 30, "taus": 20, "min_strict": 0.0}
+        slow, fast = davar(log, method=method, **options), davar(log, **options)
+        np.testing.assert_array_equal(slow["count"], fast["count"])
+        np.testing.assert_allclose(slow.avar, fast.avar, rtol=1e-8)
+        np.testing.assert_allclose(slow.window_mean, fast.window_mean, rtol=1e-9, atol=1e-15)
+
+    def test_the_papers_convention_counts_fewer_terms_and_windows(self):
+        x = np.random.default_rng(5).standard_normal(6000)
+        paper = davar(log_of(x), window=1000, step=30, taus=[0.1], method="direct", convention="paper")
+        ours = davar(log_of(x), window=1000, step=30, taus=[0.1])
+        assert (paper.sizes["time"], ours.sizes["time"]) == (166, 167)
+        assert (int(paper["count"][0, 0, 0]), int(ours["count"][0, 0, 0])) == (980, 981)
+        recursive = davar(log_of(x), window=1000, step=30, taus=[0.1], method="recursive", convention="paper")
+        np.testing.assert_allclose(recursive.avar, paper.avar, rtol=1e-9)
+
+    def test_zero_filling_makes_the_canyon_and_counting_removes_it(self):
+        """P16 divides by the gap-free number of terms: the surface sinks by the share of terms that are missing."""
+        x = np.random.default_rng(6).standard_normal(40_000)
+        x[20_000:20_400] = np.nan
+        options = {"window": 2000, "step": 200, "taus": [0.01]}
+        zero, bridge = (davar(log_of(x), gaps=gaps, **options).isel(axis=0, tau=0) for gaps in ("zero", "bridge"))
+        inside = zero.coverage < 0.9
+        assert inside.sum() >= 8
+        np.testing.assert_allclose(zero.avar / bridge.avar, bridge.coverage, rtol=1e-9)
+        assert float(zero.avar[inside].mean()) < 0.85
+        assert abs(float(bridge.avar[inside].mean()) - 1.0) < 0.1
+
+
+class TestInvariance:
+    @pytest.mark.parametrize("chunk", [999, 4096, 20_000])
+    @pytest.mark.parametrize("overlap", ["full", "octave"])
+    def test_bits_do_not_depend_on_the_chunking(self, chunk, overlap):
+        rng = np.random.default_rng(7)
+        x = rng.standard_normal((2, 20_000))
+        x[0, 5000:5003] = x[1, rng.random(20_000) < 0.1] = np.nan
+        log = log_of(x, channels={"temperature": (np.linspace(20, 30, 20_000), "degC")})
+        options = {"window": 3000, "step": 250, "taus": 15, "overlap": overlap}
+        whole = davar(log, **options)
+        with dask.config.set(scheduler="sync"):
+            lazy = davar(log.chunk(time=chunk), **options)
+            for name in ("avar", "count", "coverage", "edf", "estimator", "window_mean", "temperature", "temperature_rate"):
+                assert isinstance(lazy[name].data, da.Array), name
+                np.testing.assert_array_equal(lazy[name].values, whole[name].values, err_msg=name)
+
+    def test_a_dask_log_is_not_computed(self):
+        def forbidden(*_, **__):
+            raise AssertionError("the log was computed")
+
+        data = da.map_blocks(forbidden, chunks=((1,), (5000,) * 4), dtype=float, meta=np.empty((0, 0)))
+        surface = davar(log_of(data), window=3000, step=1000)
+        assert surface.avar.shape[1] == 18
+        with pytest.raises(AssertionError, match="the log was computed"):
+            surface.avar.compute(scheduler="sync")
+
+    @pytest.mark.parametrize("dtype", [np.float32, np.int16, np.int32, np.int64])
+    def test_narrow_types_are_summed_in_double(self, dtype):
+        x = (np.random.default_rng(8).standard_normal(5000) * 50 + 2000).astype(dtype)
+        narrow = davar(log_of(x), window=1000, step=100)
+        wide = davar(log_of(x.astype(np.float64)), window=1000, step=100)
+        np.testing.assert_allclose(narrow.avar, wide.avar, rtol=1e-12)
+
+    def test_integers_are_exact_however_large_their_mean(self):
+        x = np.random.default_rng(9).integers(-3, 4, 5000)
+        small = davar(log_of(x), window=1000, step=100)
+        large = davar(log_of(x + 2**40), window=1000, step=100)
+        np.testing.assert_array_equal(large.avar, small.avar)
+
+    def test_axes_are_independent(self):
+        x = np.random.default_rng(10).standard_normal((3, 5000))
+        x[1, 100:200] = np.nan
+        together = davar(log_of(x), window=1000)
+        alone = davar(log_of(x), window=1000, axis="y")
+        xr.testing.assert_identical(together.avar.sel(axis=["y"]), alone.avar)
+
+    def test_scaling_and_constant(self):
+        x = np.random.default_rng(11).standard_normal(5000)
+        base = davar(log_of(x), window=1000).avar
+        np.testing.assert_allclose(davar(log_of(1e4 * x + 7e6), window=1000).avar, 1e8 * base, rtol=1e-7)
+
+
+class TestAccuracy:
+    def test_a_shock_of_a_million_sigma_leaves_no_trace_behind_it(self):
+        rng = np.random.default_rng(19)
+        x = rng.standard_normal(60_000)
+        shock = 30_000
+        x[shock : shock + 200] += 1e6 * rng.standard_normal(200)
+        taus = np.unique(np.round(np.geomspace(1, 999, 20)).astype(int)) / 100
+        result = davar(log_of(x), window=2000, step=300, taus=list(taus))
+        starts = np.arange(result.sizes["time"]) * 300
+        after = starts >= shock + 200
+        want, _ = direct_surface(x[starts[after][0] :], 2000, 300, list(np.round(taus * 100).astype(int)))
+        error = np.abs(result.avar.values[0][after][: want.shape[0]] / want - 1)
+        assert error.max() <= 1e-9
+        recursive = davar(log_of(x), window=2000, step=300, taus=list(taus), method="recursive")
+        assert np.abs(recursive.avar.values[0][after][: want.shape[0]] / want - 1).max() > 1e-4
+
+    @pytest.mark.parametrize("turn", [1800.0, 108_000.0])  # deg/s; the second is 300 rev/s
+    def test_a_rotating_tool_keeps_its_noise(self, turn):
+        noise = 3e-3 * 60 * np.sqrt(400.0) * np.random.default_rng(3).standard_normal(50_000)
+        still = davar(log_of(noise, rate=400.0), window=20_000, step=10_000)
+        rotating = davar(log_of(noise + turn * 3600, rate=400.0), window=20_000, step=10_000)
+        np.testing.assert_allclose(rotating.avar, still.avar, rtol=1e-6)
+
+
+class TestGaps:
+    def test_many_small_gaps_are_bridged_and_marked(self):
+        rng = np.random.default_rng(12)
+        x = rng.standard_normal(20_000)
+        x[rng.random(20_000) < 0.2] = np.nan
+        result = davar(log_of(x), window=20_000, step=20_000, taus=[0.01, 0.05, 1.0]).isel(axis=0, time=0)
+        assert list(result.estimator.values) == [STRICT, WEIGHTED, WEIGHTED]
+        for tau, stride in ((0.05, 1), (1.0, 6)):
+            cell = result.sel(tau=tau)
+            want, count = cluster_variance(x, round(tau * 100), stride)
+            assert float(cell.avar) == pytest.approx(want, rel=1e-10)
+            assert int(cell["count"]) == count
+        # white noise is seen too high, by exactly what the mask says
+        assert float(result.white_response.sel(tau=1.0)) == pytest.approx(1.25, abs=0.02)
+
+    @pytest.mark.parametrize("block", [5, 60])
+    def test_responses_predict_what_gaps_do_to_white_and_quantization_noise(self, block):
+        rng = np.random.default_rng(13)
+        n, trials = 3000, 150
+        here = np.ones(n, dtype=bool)
+        while here.mean() > 0.75:
+            start = int(rng.integers(0, n))
+            here[start : start + int(rng.geometric(1 / block))] = False
+        white = np.where(here, rng.standard_normal((trials, n)), np.nan)
+        quantization = np.where(here, np.diff(rng.standard_normal((trials, n + 1)), axis=1), np.nan)
+        names = [str(i) for i in range(trials)]
+        for x, law, response in ((white, lambda k: 1 / k, "white_response"), (quantization, lambda k: 3 / k**2, "quantization_response")):
+            surface = davar(log_of(x, axis=names), window=n, step=n, taus=[0.01, 0.05, 0.2, 1.0, 3.0]).isel(time=0)
+            k = np.round(surface.tau * 100)
+            ratio = surface.avar.mean("axis") / law(k)
+            scatter = (surface.avar.std("axis") / law(k)) / np.sqrt(trials)
+            assert np.all(np.abs(ratio - surface[response].isel(axis=0)) < 5 * scatter)
+
+    def test_an_empty_window_is_nan_not_zero(self):
+        x = np.random.default_rng(14).standard_normal(6000)
+        x[2000:4000] = np.nan
+        result = davar(log_of(x), window=1000, step=500).isel(axis=0)
+        empty = result.window_coverage == 0
+        assert empty.sum() == 3
+        assert result.avar[empty].isnull().all()
+        assert result.window_mean[empty].isnull().all()
+        assert (result["count"][empty] == 0).all()
+        assert (result.estimator[empty] == ESTIMATORS.index("none")).all()
+
+    def test_thin_cells_are_blank_not_low(self):
+        x = np.full(1000, np.nan)
+        x[:60] = np.random.default_rng(15).standard_normal(60)
+        result = davar(log_of(x), window=1000, min_coverage=0.1)
+        assert result.avar.isnull().all()
+
+
+class TestLabels:
+    def test_windows_say_when_they_are(self):
+        x = np.zeros((1, 3000))
+        result = davar(log_of(x, rate=300.0, start="2026-01-01"), window="2s", step="1s")
+        np.testing.assert_array_equal(result.time.values[:2], np.array(["2026-01-01T00:00:01", "2026-01-01T00:00:02"], "datetime64[ns]"))
+        np.testing.assert_array_equal(
+            result.time_bounds.values[1], np.array(["2026-01-01T00:00:01", "2026-01-01T00:00:03"], "datetime64[ns]")
+        )
+        assert result.attrs["window_samples"] == 600
+        assert all("units" in result[name].attrs for name in ("avar", "count", "coverage", "edf", "window_mean", "tau"))
+
+    def test_channels_follow_the_windows(self):
+        n = 6000
+        t = np.arange(n) / 100.0
+        temperature = 20 + t / 3600 * 60  # 60 K/h
+        temperature[1000:1500] = np.nan
+        log = log_of(np.zeros(n), channels={"temperature": (temperature, "degC"), "vibration": (np.full(n, 2.0), "g")})
+        slow_times = np.arange(0, n, 100)
+        log["pressure"] = ("time_pressure", 1e5 + slow_times, {"units": "Pa"})
+        log = log.assign_coords(time_pressure=log.time.isel(time=slice(0, None, 100)).values)
+        result = davar(log, window=1000, step=500)
+        np.testing.assert_allclose(result.temperature_rate.values[[0, 5]], 60.0, rtol=1e-9)
+        assert result.temperature_rate.units == "K hour-1"
+        np.testing.assert_allclose(result.temperature.values[6], temperature[3000:4000].mean())
+        np.testing.assert_allclose(result.vibration.values, 2.0)
+        np.testing.assert_allclose(result.pressure.values[0], 1e5 + slow_times[:10].mean())
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"window": "1h"}, "longer than the record"),
+            ({"window": "10s", "step": "11s"}, "longer than the window"),
+            ({"window": "10s", "taus": [6.0]}, "longer than half of the window"),
+            ({"window": "10s", "taus": [0.001]}, "shorter than one sample"),
+            ({"window": "10s", "tau_max": "9s"}, "does not fit the window"),
+            ({"window": "3samples"}, "at least 4"),
+            ({"window": "10"}, "has no unit"),
+            ({"window": "soon"}, "not a duration"),
+            ({"window": "-10s"}, "longer than zero"),
+            ({"window": "10s", "taus": 0}, "above 0"),
+            ({"window": "10s", "axis": "q"}, "not in the log"),
+            ({"window": "10s", "method": "magic"}, "direct"),
+            ({"window": "10s", "convention": "paper"}, "method='direct'"),
+        ],
+    )
+    def test_options_that_make_no_sense_are_explained(self, options, words):
+        with pytest.raises(OptionError, match=words):
+            davar(log_of(np.zeros(6000)), **options)
+
+    def test_what_is_not_a_log_is_refused(self):
+        with pytest.raises(SchemaError, match="rate"):
+            davar(xr.Dataset({"omega": ("time", np.zeros(5))}), window="1s")
+        log = log_of(np.zeros(100))
+        log.rate.attrs["units"] = "deg/s"
+        with pytest.raises(SchemaError, match="degree hour-1"):
+            davar(log, window="1s")
+
+
+def test_published_wavelet_variances_are_ours(recordings):
+    """The authors of the R package wv published the Haar wavelet variance, half the Allan variance, of the same record."""
+    import pandas as pd
+
+    table = pd.read_csv(recordings("reference-wavelet-variance/reference_wavelet_variance.csv.gz"))
+    frame = pd.read_parquet(recordings("adis16405-static-2h47/adis_16405_imu1.parquet"))
+    table = table[table["sensor"].str.contains("ADIS") & table["channel"].str.contains("Gyro")]
+    columns = [name for name in frame.columns if "gyro" in name.lower() or name.lower().startswith(("gx", "gy", "gz"))][:3]
+    compared = 0
+    for column, (_, rows) in zip(columns, table.groupby("channel", sort=True), strict=True):
+        rows = rows.sort_values("haar_scale_s")
+        taus = list(rows["haar_scale_s"].to_numpy() / 2)
+        x = frame[column].to_numpy().astype(np.float64)
+        log = make_log(x, rate=100.0, unit="deg/s")
+        surface = davar(log, window=x.size, step=x.size, taus=[tau for tau in taus if tau <= x.size / 200], tau_max=x.size / 200)
+        ours = surface.avar.values[0, 0] / 2 / 3600.0**2
+        np.testing.assert_allclose(ours, rows["haar_wavelet_variance"].to_numpy()[: ours.size], rtol=1e-8)
+        compared += ours.size
+    assert compared > 40
