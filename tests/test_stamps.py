@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -17,8 +19,7 @@ def place(samples, *, max_gap=1e9, hold=0.75, pieces=None):
     rows = np.arange(len(stamps))
     state, ring = kernel.new_state()
     runs, events = [], []
-    edges = [0, *(pieces or []), len(rows)]
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise([0, *(pieces or []), len(rows)]):
         end = min(len(rows), b + kernel.LOOK)
         run, event = kernel.place(rows[a:end], stamps[a:end], b - a, PERIOD, hold, max_gap, state, ring)
         runs.append(run)
@@ -129,3 +130,21 @@ def test_count_along_a_lattice_survives_jitter_and_a_wrong_period():
     count, piece = kernel.track(stamps, PERIOD * 1.002, 0.1, 500 * PERIOD)
     assert piece.max() == 0
     assert count[-1] == samples[-1] - samples[0]
+
+
+@pytest.mark.parametrize("off", [1e-3, -1e-3])
+def test_a_clock_that_runs_away_skips_or_drops_single_samples(off):
+    """Jitter of a fifth of a sample must not make the decision flicker."""
+    random = np.random.default_rng(5)
+    n = 20_000
+    stamps = np.arange(n) * (1 + off) + random.uniform(-0.2, 0.2, n)
+    found, events = place(stamps.tolist())
+    kept = np.flatnonzero(np.array(found) >= 0)
+    assert np.abs(np.array(found)[kept] - stamps[kept]).max() < 1.05
+    if off > 0:
+        assert len(events) == 0
+        assert np.sum(np.diff(found) == 2) == pytest.approx(n * off, abs=1)
+    else:
+        assert set(events[:, 0]) == {DUPLICATE}
+        assert len(events) == pytest.approx(-n * off, abs=1)
+        assert np.all(np.diff(np.array(found)[kept]) == 1)

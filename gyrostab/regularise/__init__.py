@@ -147,7 +147,7 @@ def regularise(
     rate : float, optional
         Sampling rate [Hz]. Found from the stamps when not given; checked against them when given.
     tolerance : float
-        A row takes the next sample while its stamp is less than half a sample plus this from it [samples].
+        How much further than half a sample the slow course of the stamps may depart from the grid before a sample is left out [samples].
     max_gap : str or float
         A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number is in seconds.
     chunk : int

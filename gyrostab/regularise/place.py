@@ -89,7 +89,7 @@ def place_by_stamp(stamps: Stamps, rate: float, *, tolerance: float, max_gap: fl
     rate : float
         Sampling rate [Hz].
     tolerance : float
-        How much further than half a sample a stamp may be from the next sample before its place is found anew [samples].
+        How much further than half a sample the slow course of the stamps may depart from the grid before a sample is left out [samples].
     max_gap : float
         A longer step ahead is a step of the clock [s].
     where : str
