@@ -164,7 +164,8 @@ def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, A
     history = given.get("history", "")
     lines = [history] if isinstance(history, str) else [str(line) for line in history]
     given["history"] = "\n".join([*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"])
-    given.setdefault("title", TITLES[kind])
+    if given.get("title") in (None, *TITLES.values()):  # a title of ours may stem from an earlier stage
+        given["title"] = TITLES[kind]
     names = [files] if isinstance(files, str) else [str(name) for name in files]
     given.setdefault("source", "gyro log: " + ", ".join(names) if names else "gyro log")
     given |= {"Conventions": CONVENTIONS, "date_created": now, "gyrostab_version": version, "gyrostab_content": kind}

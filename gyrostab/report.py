@@ -143,8 +143,8 @@ def _summary(product: xr.Dataset) -> str:
 def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]) -> list[str]:
     lines = []
     for axis, rows in table:
-        seen = [f"{row['symbol']} = {row['median']} {row['unit']}" for row in rows if row["median"] != "–"]
-        text = f"Axis {axis}: {', '.join(seen)} (medians)." if seen else f"Axis {axis}: no coefficient is observed in any window."
+        seen = [f"{row['symbol']} = {row['median']} {row['unit']}{row['rare']}" for row in rows if row["median"] != "–"]
+        text = f"Axis {axis}: {', '.join(seen)}; medians." if seen else f"Axis {axis}: no coefficient is observed in any window."
         lines.append(text + _change(product.sel(axis=axis)))
     missing = {axis: share for axis, share in _missing(product).items() if share > 0.0}
     if missing:
@@ -158,7 +158,8 @@ def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]
 
 def _change(part: xr.Dataset) -> str:
     """Say in a sentence whether angle random walk at the end differs from that at the beginning."""
-    values = part["N"].values[np.isfinite(part["N"].values)]
+    seen = part["observable"].sel(term="N").values == OBSERVABLE.index("observed")
+    values = part["N"].values[seen]
     third = values.size // 3
     if third < 3:
         return ""
@@ -215,6 +216,7 @@ def _coefficients(part: xr.Dataset) -> list[dict[str, Any]]:
                 "median": _number(float(np.median(values)) if values.size else np.nan),
                 "range": f"{_number(low)} to {_number(high)}" if values.size else "–",
                 "observed": _share(float(seen.mean())),
+                "rare": f" (observed in {_share(float(seen.mean()))} of the windows only)" if seen.mean() < 0.5 else "",
                 "limited": _share(float(limited.mean())),
                 "limit": f"< {_number(float(np.median(limits)))}" if limits.size else "–",
             }
@@ -296,8 +298,9 @@ _READ = {
     ),
     "adev": (
         "Points are the Allan deviation of one window near the middle of the record; at each point the band holds the true value with "
-        "95 % confidence. Broken lines are the fitted noise terms, each with its own slope, and the black line is their sum: where it "
-        "leaves the band again and again, the five terms do not describe this gyro."
+        "95 % confidence. Broken lines are the fitted noise terms that are observed, each with its own slope; the others are named with "
+        "their upper limit. The black line is the sum of all five: where it leaves the band again and again, the five terms do not "
+        "describe this gyro."
     ),
     "davar_3d": (
         "The surface of the first axis; height and colour are the Allan deviation. A furrow or ridge across the surface is an event in "

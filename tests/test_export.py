@@ -185,7 +185,7 @@ def test_a_unit_that_udunits_refuses_or_misreads_is_not_written_as_units(tmp_pat
     assert open_dataset(path)["it"].attrs["units"] == units
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     values=hnp.arrays(
         np.float64, hnp.array_shapes(min_dims=3, max_dims=3, max_side=4), elements=st.floats(allow_nan=True, allow_infinity=True)
@@ -205,7 +205,7 @@ def test_round_trip_of_anything(tmp_path, values, units, stamps, notes, write):
     assert_same(before, open_dataset(write(before, tmp_path / write.__name__, overwrite=True)))
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     start=st.integers(-(2**60), 2**60),
     rate=st.sampled_from([300.0, 400.0, 99.3, 1.0, 1000 / 3, 0.1]),
@@ -410,6 +410,13 @@ def test_provenance(files):
         assert file.title.startswith("Dynamic Allan variance")
         assert file.window_samples == 1800
         assert {"date_created", "gyrostab_version", "time_coverage_start", "time_coverage_end"} <= set(file.ncattrs())
+
+
+def test_a_product_of_a_stored_surface_has_its_own_title(tmp_path, files):
+    product = synthetic.product().assign_attrs(open_surface(files["surface"]).attrs)
+    assert open_product(to_netcdf(product, tmp_path / "p.nc")).attrs["title"].endswith("Q, N, B, K and R of every window")
+    named = to_netcdf(product.assign_attrs(title="Run 7"), tmp_path / "n.nc")
+    assert open_product(named).attrs["title"] == "Run 7"
 
 
 def test_attributes_of_the_schema_reach_the_file(files):

@@ -78,6 +78,10 @@ def test_the_coefficient_table_holds_medians_ranges_and_shares(page):
     low, high = (float(text) for text in n_of_y[3].split(" to "))
     assert (low, high) == pytest.approx(tuple(np.nanquantile(values, [0.05, 0.95])), rel=0.01)
     assert n_of_y[4:] == ["deg/sqrt(h)", "90 %", "0 %", "–"]
+    q_of_x = rows[0]
+    seen = product.observable.sel(axis="x", term="Q") == 2
+    assert float(q_of_x[2]) == pytest.approx(float(product.Q.sel(axis="x").where(seen).median()), rel=0.01)
+    assert q_of_x[5:7] == ["45 %", "45 %"]
     r_of_z = rows[14]
     assert r_of_z[2:4] == ["–", "–"]
     assert r_of_z[5:7] == ["0 %", "90 %"]
@@ -90,6 +94,8 @@ def test_the_summary_is_in_plain_words(page):
     assert "2026-09-21 14:13:20" in text
     assert "looked at in 40 windows" in text
     assert "Angle random walk rises from" in text
+    assert "urad (observed in 45 % of the windows only)" in text
+    assert "R = " not in text
     assert "axis x 14 %" in text  # 4 of 40 windows hold nothing, 5 hold 70 %: 1 - 34.5 / 40 = 14 %
 
 

@@ -119,20 +119,20 @@ def _window(part: xr.Dataset, when: Any) -> int:
 
 
 def _draw_terms(panel: Axes, window: xr.Dataset, colours: list[str]) -> None:
-    """Draw each observed term as a broken line, their sum as a black one; name the limits in the legend."""
+    """Draw each observed term as a broken line, name the limits of the others, and draw the sum of all five as a black line."""
     tau = window["tau"].values
     total = np.zeros(tau.size)
     responses = {"N": "white_response", "Q": "quantization_response"}
     for number, (symbol, law) in enumerate(LAWS.items()):
         state = int(window["observable"].sel(term=symbol))
         value, error, upper = (float(window[f"{symbol}{end}"]) for end in ("", "_stderr", "_upper"))
+        term = law.avar(tau, value if np.isfinite(value) else 0.0)
+        seen = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
+        total += term * np.where(np.isfinite(seen), seen, 1.0)
         if state == _SEEN:
-            term = law.avar(tau, value)
-            seen = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
-            total += term * np.where(np.isfinite(seen), seen, 1.0)
             label = f"{symbol} = {value:.3g} ± {error:.1g} {law.label} ({law.name})"
             panel.plot(tau, np.sqrt(term), linestyle=_DASHES[number], color=colours[number], linewidth=1.3, label=label)
         elif state == _LIMIT:
             panel.plot([], [], linestyle="none", label=f"{symbol} < {upper:.3g} {law.label} ({law.name})")
     if total.any():
-        panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label="sum of the fitted terms")
+        panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label="sum of the five fitted terms")

@@ -93,7 +93,9 @@ def _draw_axis(panel: Axes, part: xr.Dataset, symbol: str, name: str, style: dic
 def _scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> None:
     """Log scale where the numbers span more than a decade, else linear from zero."""
     chosen = product.sel(axis=names)
-    numbers = np.concatenate([chosen[name].values.ravel() for name in (symbol, f"{symbol}_upper")])
+    state = chosen["observable"].sel(term=symbol).values
+    shown = (chosen[symbol].values[state == _SEEN], chosen[f"{symbol}_upper"].values[state == _LIMIT])
+    numbers = np.concatenate(shown)
     numbers = numbers[np.isfinite(numbers) & (numbers > 0)]
     if numbers.size and numbers.max() > 10 * numbers.min():
         panel.set_yscale("log")
