@@ -279,10 +279,9 @@ class _Work:
             return None
         try:
             unit = parse_unit(text)
-        except UnitError as error:
+        except UnitError:
             hint = f'known are {known_units("rate")}; give it with --unit {stem}={example}, or with a factor --unit "{stem}=0.1 arcsec/s"'
             self.problems.append(UnitError(f"{self.path.name}: column {column.header!r}: unit {text!r} is not known; {hint}"))
-            del error
             self._summarise(column, column.low, "gyro", None, text)
             return None
         allowed = ("rate", "angle") if stem == "gyro" else ("angle",)

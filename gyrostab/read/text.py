@@ -10,6 +10,7 @@ import gzip
 import re
 import zlib
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, cast
@@ -80,7 +81,7 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     intake = Intake(plan.check(), options, limit=limit)
     typing = Typing(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
-    for block in _blocks(path, layout.offset):
+    for block in _ahead(_blocks(path, layout.offset)):
         line = _take(block, line, typing, intake)
     return intake.finish(layout.notes)
 
@@ -150,6 +151,15 @@ def _blocks(path: Path, offset: int) -> Iterator[bytes]:
             rest = chunk[cut:]
         if rest.strip():
             yield rest + b"\n"
+
+
+def _ahead(blocks: Iterator[bytes]) -> Iterator[bytes]:
+    """The same blocks, each fetched (and decompressed) while the one before it is being parsed."""
+    with ThreadPoolExecutor(1, thread_name_prefix="gyrostab-read") as pool:
+        following = pool.submit(next, blocks, b"")
+        while block := following.result():
+            following = pool.submit(next, blocks, b"")
+            yield block
 
 
 def _take(block: bytes, line: int, typing: Typing, intake: Intake) -> int:
