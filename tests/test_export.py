@@ -17,7 +17,6 @@ import hypothesis.extra.numpy as hnp
 import netCDF4
 import numpy as np
 import pytest
-import synthetic
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -29,6 +28,7 @@ from gyrostab.output import new_output
 from gyrostab.schema import VARIABLES, attributes
 from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import INNER
+from tests import synthetic
 
 KINDS = {"product": synthetic.product, "surface": synthetic.surface, "log": synthetic.log}
 OPEN = {"product": open_product, "surface": open_surface, "log": open_log}
@@ -304,7 +304,7 @@ def test_a_file_can_be_rewritten_from_itself(tmp_path):
 FULL = """
 import resource, sys
 sys.path.insert(0, {tests!r})
-import synthetic
+from tests import synthetic
 from gyrostab.errors import OutputError
 from gyrostab.export import to_netcdf
 log = synthetic.log(samples=300_000)
@@ -320,7 +320,7 @@ except OutputError as error:
 @pytest.mark.parametrize("lazy", [False, True])
 def test_a_full_disk_leaves_the_old_file_and_one_message(tmp_path, lazy):
     (tmp_path / "out.nc").write_text("old")
-    code = FULL.format(tests=str(Path(__file__).parent), lazy=lazy)
+    code = FULL.format(tests=str(Path(__file__).parents[1]), lazy=lazy)
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
     assert done.stderr == ""
     assert done.stdout.startswith("out.nc: cannot be written: ")

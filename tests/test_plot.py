@@ -7,7 +7,6 @@ import sys
 
 import numpy as np
 import pytest
-import synthetic
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,6 +19,7 @@ from gyrostab.noise import LAWS, model_avar
 from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
 from gyrostab.plot.adev import band
 from gyrostab.plot.signal import thin
+from tests import synthetic
 
 
 @pytest.fixture(scope="module")

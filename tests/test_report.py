@@ -8,11 +8,11 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-import synthetic
 
 from gyrostab.errors import OutputError, SchemaError
 from gyrostab.export import open_log, open_product, to_netcdf
 from gyrostab.report import write_report
+from tests import synthetic
 
 
 class _Page(HTMLParser):
