@@ -196,6 +196,7 @@ def test_what_export_writes_is_read(tmp_path: Path, name: str) -> None:
 
     log = regular_log()
     log["vibration"].attrs["units"] = "g"
+    log.attrs |= {"source_files": ["a.csv", "b.csv"], "notes": ["a.csv: says something"]}
     write_log = export.to_netcdf if name.endswith(".nc") else export.to_zarr
     path = write_log(log, tmp_path / name)
     back, opened = read_log(path), export.open_log(path)
@@ -203,7 +204,8 @@ def test_what_export_writes_is_read(tmp_path: Path, name: str) -> None:
     for variable in log.variables:
         np.testing.assert_array_equal(back[variable].values, log[variable].values)
         assert back[variable].attrs.get("units") == opened[variable].attrs.get("units")
-    assert back.attrs["sampling_rate_hz"] == 300.0
+    for attribute in log.attrs:
+        assert back.attrs[attribute] == log.attrs[attribute]
     assert scan_file(path).axes == ("x", "z")
 
 

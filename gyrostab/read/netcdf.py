@@ -6,6 +6,7 @@ short dimension, or ``name/0`` without one; ``gyro/x`` and ``rate/x`` are gyro a
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,10 +102,10 @@ def _open_log(path: Path) -> xr.Dataset | None:
         check_log(log)
     except SchemaError as error:
         raise SchemaError(f"{path.name}: {error}") from error
+    for name in str(log.attrs.pop("json_attributes", "")).split():
+        log.attrs[name] = json.loads(log.attrs[name])
+    log.attrs = {name: value.item() if isinstance(value, np.generic) else value for name, value in log.attrs.items()}
     log.attrs.setdefault("source_files", [path.name])
-    for name in ("source_files", "notes"):
-        if isinstance(log.attrs.get(name), str):
-            log.attrs[name] = [line for line in log.attrs[name].split("\n") if line]
     return _rebuild_time(path, log)
 
 
