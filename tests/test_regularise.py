@@ -452,3 +452,34 @@ def test_on_grid_of_nothing_but_one_run_is_the_array_itself():
         lambda: iter([(np.arange(50), stamps_of(np.arange(50), 10.0))]), 10.0, tolerance=0.25, max_gap=1e9, where="x"
     )
     np.testing.assert_array_equal(on_grid(np.arange(50.0), placement, chunk=7), np.arange(50.0))
+
+
+def test_three_rows_are_enough():
+    log = regularise(raw_log(stamps_of([0, 1, 5], 10.0)))
+    assert log.attrs["sampling_rate_hz"] == 10.0
+    np.testing.assert_array_equal(log.rate.values[0], [1, 2, np.nan, np.nan, np.nan, 3])
+
+
+def test_arrival_at_random_times_loses_no_row():
+    stamps = START + np.rint(np.sort(np.random.default_rng(0).uniform(0, 100, 10_000)) * 1e9).astype(np.int64)
+    log = regularise(raw_log(stamps))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(100.0, rel=0.02)
+    assert np.isfinite(log.rate.values).sum() == 10_000
+
+
+def test_clock_set_back_in_the_middle():
+    log = regularise(raw_log(stamps_of(np.r_[0:9000, 8500:12_000], 100.0)))
+    assert gap_table(log).cause.tolist() == ["clock_step"]
+    np.testing.assert_array_equal(log.rate.values[0], np.r_[1:9001, np.nan, 9001:12_501])
+
+
+@pytest.mark.parametrize(("rate", "n"), [(700.0, 2000), (700.0, 50_000), (300.0, 50_000)])
+def test_stamps_coarser_than_the_jitter_of_a_sample(rate, n):
+    """At 700 Hz and whole milliseconds, steps are 1 ms and 2 ms: neither is the period."""
+    keep = np.random.default_rng(1).random(n) > 0.03
+    keep[:50] = True
+    samples = np.flatnonzero(keep)
+    log = regularise(raw_log(START + np.floor(samples * 1e3 / rate).astype(np.int64) * 1_000_000))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-4 if n < 10_000 else 1e-6)
+    assert np.isfinite(log.rate.values).sum() > 0.98 * len(samples)
+    assert abs(log.sizes["time"] - 1 - samples[-1]) <= 1

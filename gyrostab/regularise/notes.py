@@ -32,6 +32,10 @@ def duration(seconds: float) -> str:
     return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / 3600:.1f} h"
 
 
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def describe_rate(
     raw: xr.Dataset, estimate: RateEstimate, rate: float, odd: list[tuple[int, int, float]], placement: Placement
 ) -> list[str]:
@@ -48,7 +52,7 @@ def describe_rate(
     for row, stamp, own in odd[:_NAMED]:
         file, local = file_of(raw, row)
         notes.append(
-            f"{file}: from {stamp_text(stamp)} (row {local}) the samples come at {own:.6g} Hz and not at {rate:.6g} Hz; "
+            f"{file}: from about {stamp_text(stamp)} (row {local}) the samples come at {own:.6g} Hz and not at {rate:.6g} Hz; "
             "by their stamps samples are missing or dropped there; split the log at that row and run the parts on their own"
         )
     return notes
@@ -90,7 +94,8 @@ def _missing(raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], ra
         total = int(holes[:, 2].sum())
         share = total / placement.size
         notes.append(
-            f"{file_of(raw)[0]}: {total} samples ({duration(total / rate)}, {share:.2g} of the log) are missing in {len(holes)} places; "
+            f"{file_of(raw)[0]}: missing: {_count(total, 'sample')} ({duration(total / rate)}, {100 * share:.2g} % of the log) "
+            f"in {_count(len(holes), 'place')}; "
             "all are in the table of gaps"
         )
     return notes
@@ -104,20 +109,22 @@ def describe(raw: xr.Dataset, found: Survey, placement: Placement, table: NDArra
     twice = events[events[:, 0] == DUPLICATE]
     if len(twice):
         file, local = file_of(raw, int(twice[:, 2].min()))
-        notes.append(f"{file}: {len(twice)} rows fall on a sample that is taken and were dropped, the first is row {local}")
+        notes.append(f"{file}: dropped as their sample is taken: {_count(len(twice), 'row')}, first row {local}")
     late = events[events[:, 0] == OUT_OF_ORDER]
     if len(late):
         kept = int((samples_of(placement, late[:, 2]) >= 0).sum())
         file, local = file_of(raw, int(late[:, 2].min()))
         notes.append(
-            f"{file}: {len(late)} rows are out of order, the first is row {local}; "
+            f"{file}: out of order: {_count(len(late), 'row')}, first row {local}; "
             f"{kept} were put in their place, {len(late) - kept} dropped"
         )
     lost = found.rows - found.absent - placement.placed - len(twice) - (len(late) - kept if len(late) else 0)
     if lost > 0:
-        notes.append(f"{where}: {lost} rows without a readable time stamp were dropped, as their neighbours do not tell where they belong")
+        notes.append(
+            f"{where}: dropped for want of a readable time stamp: {_count(lost, 'row')} whose neighbours do not tell where they belong"
+        )
     infinite = int((found.infinite[:, 1] - found.infinite[:, 0]).sum())
     if infinite:
-        notes.append(f"{where}: {infinite} rows hold an infinite value, taken as missing")
+        notes.append(f"{where}: infinite values in {_count(infinite, 'row')}, taken as missing")
     notes += [f"{where}: axis {axis} never changes its value; is the sensor dead, or the column the wrong one?" for axis in found.constant]
     return notes

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -25,6 +26,7 @@ Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 _GAIN = 0.1
 _SURE = 500.0  # samples over which the first estimate of the period of a long log is trusted to count
 _MAX_PIECES = 200_000
+_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,25 @@ class RateEstimate:
     counted: bool
     coarse: bool
     raw: float
+
+
+def _recut(stamps: Stamps, size: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Give the same rows and stamps in blocks of `size`, so that no result depends on how they came."""
+    held: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    waiting = 0
+    for block in stamps():
+        held.append(block)
+        waiting += len(block[0])
+        if waiting < size:
+            continue
+        rows, values = (np.concatenate(column) for column in zip(*held, strict=True))
+        whole = waiting // size * size
+        for begin in range(0, whole, size):
+            yield rows[begin : begin + size], values[begin : begin + size]
+        held, waiting = [(rows[whole:], values[whole:])], waiting - whole
+    if waiting:
+        rows, values = (np.concatenate(column) for column in zip(*held, strict=True))
+        yield rows, values
 
 
 def _pools(stamps: Stamps, *, size: int = 8192, most: int = 64) -> list[NDArray[np.int64]]:
@@ -87,11 +108,12 @@ def _shared(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
 
 
 def _refined(steps: NDArray[np.float64], period: float) -> float:
+    start = period
     for _ in range(30):
         near = np.abs(steps) < 5.5 * period
         count = np.rint(steps[near] / period).sum()
-        if count <= 0:
-            return period
+        if count <= 0 or not 0.3 < period / start < 2.0:  # there is no lattice
+            return start
         new = float(steps[near].sum() / count)
         if abs(new - period) < 1e-12 * period:
             break
@@ -133,7 +155,7 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
         return _throughput(parts, ticks=True), True, True
     period = _on_a_line(parts)
     if period is None:
-        period = _refined(steps, float(np.median(rising)))
+        period = _refined(steps, float(np.quantile(rising, 0.5, method="lower")))
         if _misfit(steps, period) > 0.2:  # with most rows missing, the median step is not one sample
             shorter = _refined(steps, float(np.quantile(rising, 0.1)))
             period = shorter if _misfit(steps, shorter) < 0.15 else period
@@ -184,13 +206,14 @@ def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest:
     table: list[tuple[float, ...]] = []
     zero: int | None = None
     for _, block in stamps():
-        block = block[block != NO_STAMP]
+        known = np.flatnonzero(block != NO_STAMP)
+        block = block[known]
         if len(block) == 0:
             continue
         zero = int(block[0]) if zero is None else zero
         if counted:
             piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
-            count = np.arange(len(block))
+            count = known  # a row counts, with or without a stamp
         else:
             count, piece = track(block, period, _GAIN, longest)
         if coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1:  # only there the true time is known
@@ -285,6 +308,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     >>> estimate_rate(lambda: iter([(np.arange(1000), stamps)]), where="tool.csv").rate
     300.0
     """
+    stamps = partial(_recut, stamps, _BLOCK)
     parts = _pools(stamps)
     if not parts:
         raise TimeError(
@@ -311,12 +335,12 @@ def odd_stretches(stamps: Stamps, period: float, *, size: int = 1024) -> list[tu
     """
     found: list[tuple[int, int, float]] = []
     inside = False
-    for rows, values in stamps():
+    for rows, values in _recut(stamps, 64 * size):
         known = values != NO_STAMP
         rows, values = rows[known], values[known]
-        for begin in range(0, len(values) - 63, size):
+        for begin in range(0, len(values), size):
             part = values[begin : begin + size]
-            if len(part) < 64:
+            if len(part) < size // 4:
                 break
             pace = float(np.median(np.diff(part[::16]))) / 16
             own = None if abs(pace / period - 1) < 0.02 else _on_a_line([part])
