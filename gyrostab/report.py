@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["write_report"]
 
 _LONGEST_GAPS = 20
-_GAIN = 1.5  # a change of N over the record that is worth a sentence
+_GAIN = 1.5  # a variation of N over the record that is worth a sentence
 
 
 def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.Dataset | None = None, overwrite: bool = False) -> Path:
@@ -157,17 +157,16 @@ def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]
 
 
 def _change(part: xr.Dataset) -> str:
-    """Say in a sentence whether angle random walk at the end differs from that at the beginning."""
+    """Say in a sentence how far angle random walk varies over the record, and when it is highest."""
     seen = part["observable"].sel(term="N").values == OBSERVABLE.index("observed")
     values = part["N"].values[seen]
-    third = values.size // 3
-    if third < 3:
+    if values.size < 5:
         return ""
-    first, last = float(np.median(values[:third])), float(np.median(values[-third:]))
-    if first <= 0.0 or last <= 0.0 or max(first, last) < _GAIN * min(first, last):
+    low, high = np.quantile(values, [0.05, 0.95])
+    if low <= 0.0 or high < _GAIN * low:
         return ""
-    verb = "rises" if last > first else "falls"
-    return f" Angle random walk {verb} from {_number(first)} to {_number(last)} deg/sqrt(h) (medians of the first and last third)."
+    when = _stamp(part["time"].values[seen][np.argmax(values)])
+    return f" Angle random walk varies from {_number(low)} to {_number(high)} deg/sqrt(h) and is highest around {when}."
 
 
 def _facts(product: xr.Dataset) -> list[tuple[str, str]]:
