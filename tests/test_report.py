@@ -97,7 +97,7 @@ def test_the_summary_is_in_plain_words(page):
     said = re.search(r"Axis y:.*?Angle random walk varies from (\S+) to (\S+) deg/sqrt\(h\) and is highest around (\S+ \S+)\.", text)
     assert said is not None
     assert [float(said[1]), float(said[2])] == pytest.approx(n.quantile([0.05, 0.95]).values, rel=0.01)
-    assert said[3] == str(n.time[n.argmax()].values)[:19].replace("T", " ")
+    assert said[3] == str(n.time[n.argmax("time")].values)[:19].replace("T", " ")
     assert "urad (observed in 45 % of the windows only)" in text
     assert "R = " not in text
     assert "axis x 14 %" in text  # 4 of 40 windows hold nothing, 5 hold 70 %: 1 - 34.5 / 40 = 14 %
