@@ -19,7 +19,7 @@ from gyrostab.kernels.least_squares import identify_noise
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_theta
 from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
-from gyrostab.noise import HOUR, avar_columns
+from gyrostab.noise import HOUR, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_log, signal_name
 from gyrostab.timegrid import first_stamp, grid_times
 from gyrostab.windows import averaging_factors, samples, thin
@@ -214,12 +214,6 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
     pairs = np.stack([pair_products(unit.window, k, s)[:, :, 0, 0] for k, s in one], axis=-1)
     ramps = np.stack([ramp_products(unit.window, k, s)[:, 0, 0] for k, s in one], axis=-1)
     return columns, weight, to_samples, pairs, ramps
-
-
-def sample_squares(rate: float) -> NDArray[np.float64]:
-    """Squared coefficients of the five terms in sample units (rate per sample in degree per hour), per squared coefficient."""
-    one_sample = np.array([3.0, 1.0, 2.0 * np.log(2.0) / np.pi, 1.0 / 3.0, 0.5])
-    return np.asarray(avar_columns(1.0 / rate) / one_sample)
 
 
 def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:

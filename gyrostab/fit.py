@@ -11,12 +11,11 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from gyrostab.davar import sample_squares
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.covariance import pair_products, ramp_products
 from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
 from gyrostab.kernels.pairs import white_pair_sum
-from gyrostab.noise import LAWS, TERMS, avar_columns
+from gyrostab.noise import LAWS, TERMS, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_surface
 from gyrostab.windows import thin
 

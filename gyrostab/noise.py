@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LAWS", "TERMS", "NoiseLaw", "avar_columns", "model_avar"]
+__all__ = ["LAWS", "TERMS", "NoiseLaw", "avar_columns", "model_avar", "sample_squares"]
 
 HOUR = 3600.0
 #: One microradian per second in degree per hour.
@@ -125,3 +125,21 @@ def model_avar(tau: Any, coefficients: Mapping[str, float]) -> NDArray[np.float6
     9.0
     """
     return np.asarray(sum((LAWS[symbol].avar(tau, value) for symbol, value in coefficients.items()), np.zeros(np.shape(tau))))
+
+
+def sample_squares(rate: float) -> NDArray[np.float64]:
+    """Factor from squared coefficients to sample units, where the interval is 1 and angles are in samples times rate.
+
+    Parameters
+    ----------
+    rate : float
+        Sampling rate [Hz].
+
+    Returns
+    -------
+    ndarray, shape (5,)
+        In the order of `TERMS`; times a squared coefficient it gives the term of ``3 q / k^2``, ``n / k``,
+        ``(2 ln 2 / pi) b``, ``k w / 3`` or ``r k^2 / 2`` in degree2 hour-2 for an averaging factor k.
+    """
+    one_sample = np.array([3.0, 1.0, 2.0 * math.log(2.0) / math.pi, 1.0 / 3.0, 0.5])
+    return np.asarray(avar_columns(1.0 / rate) / one_sample)

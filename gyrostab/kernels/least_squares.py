@@ -288,7 +288,7 @@ def _normal_equations(y, design, factor, n):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _term(a, chosen, normal, right, whitened, factor, squares, spread, result):  # type: ignore[no-untyped-def]
+def _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, result):  # type: ignore[no-untyped-def]
     """Estimate of one term, free of sign beside the chosen ones, and how its variance grows with the term itself."""
     terms, n = whitened.shape
     subset = chosen | 1 << a
@@ -322,8 +322,7 @@ def _term(a, chosen, normal, right, whitened, factor, squares, spread, result): 
             for j in range(n):
                 total += weights[i] * weights[j] * spread[p, i, j]
         result[3 + p, a] = total
-    everything = (1 << terms) - 1
-    if _solve_subset(scaled, unit, everything, row):
+    if _solve_subset(scaled, unit, allowed, row):
         result[6, a] = 1.0 / max(row[a] * scale[a] * normal[a, a], 1.0)
     else:
         result[6, a] = 0.0
@@ -368,10 +367,15 @@ def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, r
     rest = data
     for _ in range(6):
         previous = squares.copy()
-        _covariance(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, factor)
-        for i in range(n):
-            factor[i, i] += 1e-16 * data[i] * data[i] + 1e-10 * factor[i, i]  # a window without noise stays solvable
-        if not _cholesky(factor, n):
+        definite = False
+        jitter = 1e-7  # the sums over lags are good to about this; a strong ramp may need more
+        while not definite and jitter < 1.0:
+            _covariance(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, factor)
+            for i in range(n):  # the second part keeps a window without any noise solvable
+                factor[i, i] += jitter * factor[i, i] + 1e-16 * data[i] * data[i]
+            definite = _cholesky(factor, n)
+            jitter *= 10.0
+        if not definite:
             return np.nan, 0, n
         normal, right, whitened, rest = _normal_equations(data, design, factor, n)
         chosen = solve_nonnegative(normal, right, allowed, squares)
@@ -398,7 +402,7 @@ def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, r
         for i in range(n):
             for j in range(n):
                 spread[1, i, j] -= spread[0, i, j] + spread[2, i, j]
-        _term(a, chosen, normal, right, whitened, factor, squares, spread, result)
+        _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, result)
     chi2 = 0.0
     for i in range(n):
         misfit = rest[i]

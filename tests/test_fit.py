@@ -1,0 +1,242 @@
+"""Confidence intervals and fitted coefficients against simulated truth; the statistics are claims and checked as such."""
+
+from __future__ import annotations
+
+import dask.array as da
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.confidence import confidence_interval
+from gyrostab.davar import davar
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.fit import fit_noise
+from gyrostab.kernels.covariance import pair_products
+from gyrostab.kernels.least_squares import solve_nonnegative
+from gyrostab.kernels.pairs import white_pair_sum
+from gyrostab.log import make_log
+from gyrostab.noise import LAWS, TERMS, model_avar
+from gyrostab.schema import OBSERVABLE
+from tests.noise_records import flicker, lose, quantization, random_walk, white
+
+RATE = 100.0
+
+
+def windows_of(x, **options):
+    """Surface of independent trials, one window each, laid end to end on one axis."""
+    trials, n = x.shape
+    return davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=n, step=n, **options)
+
+
+def records(kind, rng, trials, n):
+    if kind == "white":
+        return white(rng, trials, n, N=0.01, rate=RATE), {"N": 0.01}
+    if kind == "flicker":
+        return flicker(rng, trials, n, B=1.0), {"B": 1.0}
+    return random_walk(rng, trials, n, K=20.0, rate=RATE), {"K": 20.0}
+
+
+@pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.1, 5)])
+@pytest.mark.parametrize("kind", ["white", "flicker", "random walk"])
+def test_95_percent_intervals_hold_the_truth(kind, share, block):
+    """2000 trials at every averaging time; the share of hits has a binomial sd of 0.5 %, and nine taus are looked at."""
+    rng = np.random.default_rng([1, len(kind), block])
+    x, law = records(kind, rng, 2000, 700)
+    surface = windows_of(lose(rng, x, share, block), taus="octave").isel(axis=0)
+    truth = model_avar(surface.tau, law) * (surface.white_response if kind == "white" else 1.0)
+    whole = surface.expand_dims("axis").transpose("axis", "time", "tau", "bnds")
+    for product in (whole, fit_noise(whole)):
+        limits = confidence_interval(product).isel(axis=0)
+        here = limits.avar_lower.notnull()
+        assert here.mean() > 0.99
+        hit = ((limits.avar_lower <= truth) & (truth <= limits.avar_upper)).where(here).mean("time")
+        assert 0.93 <= float(hit.mean()) <= 0.97
+        assert 0.92 <= float(hit.min())
+        assert float(hit.max()) <= 0.98
+
+
+def test_degrees_of_freedom_are_those_of_greenhall():
+    """allantools computes the same published tables by a different route; its white-noise case is approximate at short tau."""
+    from allantools.ci import edf_greenhall
+
+    window = 1000
+    for alpha, term in ((0, 1), (-1, 2), (-2, 3)):
+        for k in (20, 100, 333):
+            ks = np.array([k])
+            product = pair_products(window, ks, np.zeros(1, dtype=np.int64))[term, term, 0, 0]
+            mean = {1: 1 / k, 2: 2 * np.log(2) / np.pi, 3: k / 3}[term]
+            expected = edf_greenhall(alpha, 2, k, window + 1, overlapping=True, modified=False)
+            assert 2 * mean**2 / product == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize("k", [1, 2, 7, 40])
+def test_closed_form_of_the_white_pair_sum(k):
+    """Against the sum itself, the correlation taken from the weights of the second difference."""
+    weights = np.concatenate([-np.ones(k), np.ones(k)])
+    correlation = np.correlate(weights, weights, "full")[2 * k - 1 :] / (2 * k)
+    for n in (1, 2, k, 2 * k, 100):
+        rho = np.zeros(n)
+        rho[: min(n, 2 * k)] = correlation[: min(n, 2 * k)]
+        lags = np.arange(1, n)
+        assert white_pair_sum(n, k) == pytest.approx(n + 2 * np.sum((n - lags) * rho[1:] ** 2), rel=1e-10)
+
+
+def test_covariance_between_averaging_times_is_that_of_simulated_noise():
+    rng = np.random.default_rng(3)
+    ks = np.array([1, 2, 5, 20, 100])
+    x = white(rng, 4000, 600, N=0.01, rate=RATE) + random_walk(rng, 4000, 600, K=30.0, rate=RATE) + quantization(
+        rng, 4000, 600, Q=0.2, rate=RATE
+    )
+    avar = windows_of(x, taus=list(ks / RATE)).avar.values[0]
+    from gyrostab.noise import sample_squares
+
+    squares = np.array([0.2, 0.01, 0.0, 30.0]) ** 2 * sample_squares(RATE)[:4]
+    predicted = np.einsum("a,b,abij->ij", squares, squares, pair_products(600, ks, np.zeros_like(ks)))
+    scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
+    np.testing.assert_allclose(np.cov(avar.T) / scale, predicted / scale, atol=0.12)
+
+
+@pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])
+def test_standard_errors_are_right(share, block):
+    """z-scores of repeated simulations have a standard deviation of 0.9 to 1.1, also through gaps."""
+    rng = np.random.default_rng([4, block])
+    truth = {"Q": 0.3, "N": 0.01, "K": 400.0}
+    x = white(rng, 1000, 3000, N=truth["N"], rate=RATE) + quantization(rng, 1000, 3000, Q=truth["Q"], rate=RATE)
+    x += random_walk(rng, 1000, 3000, K=truth["K"], rate=RATE)
+    surface = windows_of(lose(rng, x, share, block), taus=24)
+    product = fit_noise(surface)
+    for term, value in truth.items():
+        z = (product[term] - value) / product[f"{term}_stderr"]
+        assert 0.9 <= float(z.std()) <= 1.1, term
+    assert 0.7 < float((product.fit_chi2 / product.fit_dof).mean()) < 1.2
+    # B cannot be negative and takes a little from its neighbours; without it they are unbiased
+    for term, value in truth.items():
+        assert float(fit_noise(surface, terms="QNK")[term].mean()) == pytest.approx(value, rel=0.03), term
+
+
+def test_flicker_alone_gives_b():
+    rng = np.random.default_rng(5)
+    product = fit_noise(windows_of(flicker(rng, 600, 2000, B=0.5), taus=20))
+    z = (product.B - 0.5) / product.B_stderr
+    assert 0.88 <= float(z.std()) <= 1.12
+    assert float(product.B.mean()) == pytest.approx(0.5, rel=0.03)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_what_is_not_there_is_rarely_claimed_and_its_limit_holds(share):
+    """White noise only: each absent term is called observed in about 1 % of windows; limits cover a small truth."""
+    rng = np.random.default_rng([6, int(share * 10)])
+    product = fit_noise(windows_of(lose(rng, white(rng, 2000, 2000, N=0.01, rate=RATE), share, 20), taus=20))
+    for term in "QBKR":
+        assert float((product.observable.sel(term=term) == OBSERVABLE.index("observed")).mean()) <= 0.025
+    assert (product.observable.sel(term="N") == OBSERVABLE.index("observed")).all()
+    rng = np.random.default_rng([7, int(share * 10)])
+    x = white(rng, 1000, 2000, N=0.01, rate=RATE) + flicker(rng, 1000, 2000, B=0.4)
+    product = fit_noise(windows_of(lose(rng, x, share, 20), taus=20))
+    limited = product.observable.sel(term="B") == OBSERVABLE.index("upper_limit_only")
+    assert limited.sum() > 300
+    assert float((product.B_upper >= 0.4).where(limited).mean()) >= 0.95
+
+
+def test_a_pure_ramp_is_r():
+    t = np.arange(20_000) / RATE / 3600
+    x = 36.0 * t + 1e-3 * np.random.default_rng(8).standard_normal(20_000)
+    product = fit_noise(davar(make_log(x, rate=RATE, unit="deg/h"), window=5000))
+    np.testing.assert_allclose(product.R, 36.0, rtol=2e-3)
+
+
+def test_gap_aware_columns_remove_the_bias_that_nominal_columns_have():
+    """20 % missing in blocks of five: nominal columns read N a quarter high, the columns of the mask do not."""
+    rng = np.random.default_rng(9)
+    x = lose(rng, white(rng, 40, 20_000, N=0.01, rate=RATE), 0.2, 5)
+    surface = windows_of(x, taus=24, min_strict=1.0)  # cluster means throughout
+    aware = fit_noise(surface, terms="QN")
+    ones = xr.ones_like(surface.white_response)
+    nominal = fit_noise(surface.assign(white_response=ones, quantization_response=ones), terms="N")
+    assert float(aware.N.mean()) == pytest.approx(0.01, rel=0.005)
+    assert float(nominal.N.mean()) > 0.0101
+
+
+def test_the_fit_of_deviations_of_the_2015_paper_is_not_additive():
+    """P15 adds deviations where variances add: with N and K together it misses both, the fit of variances neither."""
+    tau = np.geomspace(0.01, 1000, 30)
+    truth = {"N": 0.01, "K": 5.0}
+    surface = windows_of(np.zeros((2, 300_000)), taus=list(np.round(tau, 2)))
+    surface["avar"] = xr.zeros_like(surface.avar) + model_avar(surface.tau, truth)
+    good, paper = fit_noise(surface), fit_noise(surface, method="adev")
+    for term, value in truth.items():
+        assert float(good[term][0, 0]) == pytest.approx(value, rel=1e-3)
+    assert abs(float(paper["K"][0, 0]) / truth["K"] - 1) > 0.03
+
+
+def test_window_without_data_is_said_to_see_nothing():
+    x = np.random.default_rng(10).standard_normal((3, 1000))
+    x[1] = np.nan
+    product = fit_noise(windows_of(x))
+    assert (product.observable[0, 1] == OBSERVABLE.index("not_observable")).all()
+    assert product.N.isnull().values.tolist() == [[False, True, False]]
+
+
+def test_two_averaging_times_cannot_tell_five_terms_apart():
+    product = fit_noise(windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01, 0.1]))
+    assert (product.observable == OBSERVABLE.index("not_observable")).any()
+    chosen = fit_noise(windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01, 0.1]), terms="N")
+    assert (chosen.observable.sel(term="N") == OBSERVABLE.index("observed")).all()
+    assert (chosen.observable.sel(term="Q") == OBSERVABLE.index("not_observable")).all()
+
+
+def test_a_lazy_surface_stays_lazy_and_fits_the_same():
+    x = np.random.default_rng(12).standard_normal((2, 20_000))
+    log = make_log(x, rate=RATE, unit="deg/h")
+    eager = fit_noise(davar(log, window=2000, step=500))
+    lazy = fit_noise(davar(log.chunk(time=7000), window=2000, step=500))
+    assert isinstance(lazy.N.data, da.Array)
+    for name in (*TERMS, "N_stderr", "K_upper", "observable", "fit_chi2", "edf"):
+        np.testing.assert_array_equal(lazy[name].values, eager[name].values)
+
+
+def test_many_averaging_times_are_thinned_for_the_fit():
+    surface = davar(make_log(np.random.default_rng(13).standard_normal(6000), rate=RATE, unit="deg/h"), window=3000, taus="all")
+    product = fit_noise(surface)
+    assert product.sizes["tau"] == 1000
+    assert product.edf.notnull().all()
+    assert float(product.N.mean()) == pytest.approx(1 / 600, rel=0.05)
+
+
+def test_nonnegative_solution_beats_every_other_point():
+    """The exact solution against many random feasible points, and against scipy."""
+    from scipy.optimize import nnls
+
+    rng = np.random.default_rng(14)
+    for _ in range(50):
+        design = rng.standard_normal((12, 5)) * 10.0 ** rng.integers(-6, 6, 5)
+        data = rng.standard_normal(12)
+        solution = np.empty(5)
+        solve_nonnegative(design.T @ design, design.T @ data, 31, solution)
+        expected, residual = nnls(design, data)
+        assert np.linalg.norm(design @ solution - data) <= residual * (1 + 1e-6)
+        np.testing.assert_allclose(design @ solution, design @ expected, atol=1e-5)
+
+
+def test_every_number_carries_its_unit():
+    product = fit_noise(windows_of(np.random.default_rng(15).standard_normal((3, 1000))))
+    for term, law in LAWS.items():
+        assert product[term].units == law.units
+        assert product[term].unit_label == law.label
+        assert product[f"{term}_stderr"].units == law.units
+    np.testing.assert_allclose(product.N_squared, product.N**2)
+    assert product.K_squared.units == "degree2 hour-3"
+
+
+def test_bad_calls_are_explained():
+    surface = windows_of(np.random.default_rng(16).standard_normal((3, 1000)))
+    with pytest.raises(OptionError, match="Q, N, B, K, R"):
+        fit_noise(surface, terms="NX")
+    with pytest.raises(OptionError, match="gls"):
+        fit_noise(surface, method="slope")
+    with pytest.raises(SchemaError, match="avar"):
+        fit_noise(surface.drop_vars("avar"))
+    with pytest.raises(SchemaError, match="white_response"):
+        fit_noise(surface.drop_vars("white_response"))
+    with pytest.raises(OptionError, match="between 0 and 1"):
+        confidence_interval(surface, level=95)
