@@ -170,14 +170,16 @@ def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tup
     length = samples(window, rate, "window")
     if length > available:
         raise OptionError(
-            f"the window of {length / rate:g} s ({length} samples) is longer than the record of {available / rate:g} s; give a shorter --window"
+            f"the window of {length / rate:g} s ({length} samples) is longer than the record of {available / rate:g} s; "
+            "give a shorter --window"
         )
     if length < 4:
         raise OptionError(f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at {rate:g} Hz)")
     hop = max(1, length // 10) if step is None else samples(step, rate, "step")
     if hop > length:
         raise OptionError(
-            f"the step of {hop / rate:g} s is longer than the window of {length / rate:g} s, so samples would be left out; give a shorter --step"
+            f"the step of {hop / rate:g} s is longer than the window of {length / rate:g} s, so samples would be left out; "
+            "give a shorter --step"
         )
     return length, hop
 
@@ -187,9 +189,7 @@ def _units_of_work(n_samples: int, unit: Unit) -> list[tuple[int, int]]:
     points = unit.window + (1 if unit.angle else 0)
     n_windows = (n_samples - points) // unit.step + 1
     per_unit = max(8, (max(4 * unit.window, 2**18) - unit.window) // unit.step)
-    return [
-        (first * unit.step, (min(first + per_unit, n_windows) - 1) * unit.step + points) for first in range(0, n_windows, per_unit)
-    ]
+    return [(first * unit.step, (min(first + per_unit, n_windows) - 1) * unit.step + points) for first in range(0, n_windows, per_unit)]
 
 
 def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.covariance import pair_products, ramp_products
+from gyrostab.kernels.covariance import STOCHASTIC, pair_products, ramp_products
 from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.noise import LAWS, TERMS, avar_columns, sample_squares
@@ -109,7 +109,6 @@ def _fit_gls(surface: xr.Dataset, allowed: int) -> xr.Dataset:
     chosen = _choose(ks)
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
     tables = _Tables(ks[chosen], shifts, rate, window)
-    n_axis, n_time, n_tau = (surface.sizes[dim] for dim in ("axis", "time", "tau"))
 
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = [np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64) for a in arrays]
@@ -126,7 +125,7 @@ def _fit_gls(surface: xr.Dataset, allowed: int) -> xr.Dataset:
     out = _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)))
     out["fit_chi2"] = (("axis", "time"), parts[4 * n], attributes("fit_chi2"))
     out["fit_dof"] = (("axis", "time"), parts[4 * n + 1], attributes("fit_dof"))
-    if chosen.size == n_tau:  # otherwise davar's own, for every averaging time, stands
+    if chosen.size == surface.sizes["tau"]:  # otherwise davar's own, for every averaging time, stands
         out["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
     out.attrs["fit_method"] = "gls"
     return out
@@ -142,6 +141,9 @@ class _Tables:
         self.ramps = ramp_products(window, ks, shifts)
         terms = window - 2 * ks + 1
         self.weight = np.array([n**2 / white_pair_sum(int(n), int(k)) for n, k in zip(terms, ks, strict=True)])
+        own = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
+        #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp has no scatter of its own.
+        self.own_dof = np.vstack([2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)])
 
 
 def _choose(ks: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -154,9 +156,7 @@ def _choose(ks: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -> NDArray[np.float64]:
     """Coefficients, errors, limits, observability (n_terms each), chi2, dof and edf of each window, side by side."""
-    result, misfit, dof = fit_windows(
-        *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed
-    )
+    result, misfit, dof = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
     square, error = field["square"], field["square_stderr"]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -165,15 +165,16 @@ def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -
         stderr = np.where(square > error, error / (2.0 * value), np.sqrt(np.maximum(error, 0.0)) / np.where(square > error, 1.0, 2.0))
         visible = np.isfinite(square) & (field["separation"] > _SEPARATION)
         observed = visible & (square > 0) & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
-        upper = np.where(visible & ~observed, np.sqrt(_upper_limit(field)), np.nan)
+        limit = np.minimum(_limit_of_estimate(field), _limit_of_cell(flat, square, dof, tables))
+        upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
     stderr = np.where(visible, stderr, np.nan)
     value = np.where(visible, value, np.nan)
     observable = np.where(observed, 2.0, np.where(visible & np.isfinite(upper), 1.0, 0.0))
     return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
 
 
-def _upper_limit(field: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
-    """95 % upper limit of a squared coefficient.
+def _limit_of_estimate(field: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """95 % upper limit of a squared coefficient from its estimate.
 
     The estimate free of sign has the variance ``a + b s + c s^2`` when the truth is s. The part in ``s^2`` is the
     term's own, a chi-square with ``2 / c`` degrees of freedom, whose lower 5 % point is ``q s``; the rest is taken as
@@ -181,11 +182,36 @@ def _upper_limit(field: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
     """
     estimate = np.maximum(field["free"], 0.0)
     a, b, c = (np.maximum(field[name], 0.0) for name in ("variance_null", "variance_linear", "variance_square"))
-    freedom = 2.0 / np.maximum(c, 1e-12)
-    lower = gammaincinv(freedom / 2.0, 0.05) * 2.0 / freedom
+    lower = _low_quantile(2.0 / np.maximum(c, 1e-12))
     curve = 1.0 - (1.0 - lower) ** 2
     half = estimate + 0.5 * _LIMIT**2 * b
     return np.asarray((half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT**2 * a), 0.0))) / curve)
+
+
+def _limit_of_cell(
+    flat: list[NDArray[np.float64]], square: NDArray[np.float64], dof: NDArray[np.float64], tables: _Tables
+) -> NDArray[np.float64]:
+    """95 % upper limit of a squared coefficient from one cell, which cannot be less than the term's own part of it.
+
+    The cell is the one where the fitted model promises the lowest limit, so that its own scatter does not choose it.
+    """
+    avar, white, quantization, factor = flat
+    response = np.ones((*avar.shape, len(TERMS)))
+    response[..., 0], response[..., 1] = quantization, white
+    columns = tables.columns * response
+    model = np.einsum("wka,wa->wk", columns, np.nan_to_num(square))
+    freedom = np.minimum(tables.own_dof.T * factor[..., None], 1e6)
+    freedom[..., -1] = np.minimum(freedom[..., -1], dof)
+    reach = 1.0 / (_low_quantile(freedom) * columns)
+    promised = np.where(np.isfinite(avar)[..., None] & np.isfinite(reach), model[..., None] * reach, np.inf)
+    best = promised.argmin(axis=1)[:, None, :]
+    limit = np.take_along_axis(avar[..., None] * reach, best, axis=1)[:, 0]
+    return np.asarray(np.where(np.isfinite(limit), limit, np.inf))
+
+
+def _low_quantile(freedom: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lower 5 % point of a chi-square over its degrees of freedom."""
+    return np.asarray(gammaincinv(freedom / 2.0, 0.05) * 2.0 / freedom)
 
 
 def _assemble(surface: xr.Dataset, values: list[Any], errors: list[Any], limits: list[Any], observable: list[Any]) -> xr.Dataset:

@@ -127,7 +127,8 @@ def _require(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -
         if name not in dataset.variables:
             raise SchemaError(f"this is not a {what}: it has no variable {name!r}; it has {sorted(map(str, dataset.variables))}")
         if dataset[name].dims != expected:
-            raise SchemaError(f"{what}: variable {name!r} has dimensions {dataset[name].dims}, expected {expected}; transpose or rename them")
+            has = dataset[name].dims
+            raise SchemaError(f"{what}: variable {name!r} has dimensions {has}, expected {expected}; transpose or rename them")
 
 
 def check_raw(raw: xr.Dataset) -> None:
@@ -154,7 +155,7 @@ def check_log(log: xr.Dataset) -> None:
 def _check_units(dataset: xr.Dataset, name: str) -> None:
     units = dataset[name].attrs.get("units")
     if units != SIGNAL_UNITS[name]:
-        raise SchemaError(f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; readers convert, arrays must say their unit")
+        raise SchemaError(f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; convert it and say so")
 
 
 def check_surface(surface: xr.Dataset) -> None:

@@ -127,10 +127,12 @@ class TimeGridIndex(CoordinateTransformIndex):
         return self.transform.rate / self.transform.stride
 
     def isel(self, indexers: Mapping[Any, Any]) -> TimeGridIndex | None:
+        """Keep the index for slices; other selections get an ordinary coordinate."""
         part = indexers[self.transform.dims[0]]
         return type(self)(self.transform.cut(part)) if isinstance(part, slice) else None
 
     def sel(self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None) -> IndexSelResult:
+        """Positions of stamps, exactly or nearest; of slices of time, both ends included; of a day such as "2026-11-20"."""
         (name,) = self.transform.coord_names
         label = labels[name]
         dim = self.transform.dims[0]
@@ -177,6 +179,7 @@ class TimeGridIndex(CoordinateTransformIndex):
         return slice(edge(label.start, "left"), edge(label.stop, "right"), label.step)
 
     def to_pandas_index(self) -> pd.Index:
+        """Return the whole axis as a DatetimeIndex, in memory."""
         (dim,) = self.transform.dims
         return pd.DatetimeIndex(self.transform.generate_coords()[self.transform.coord_names[0]], name=dim)
 

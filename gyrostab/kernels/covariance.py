@@ -66,13 +66,10 @@ def _weight(lag, n1, n2):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _sum_pairs(window, k1, k2, thin, logarithm, products, means):  # type: ignore[no-untyped-def]
-    """Add up products ``r_a r_b`` and values ``r_a`` over all pairs of terms, each divided by the number of pairs."""
+def _add_smooth(window, k1, k2, logarithm, products, means):  # type: ignore[no-untyped-def]
+    """Add the pairs of the terms N, B and K, whose covariances are smooth in the lag on the scale of the shorter factor."""
     n1, n2 = window - 2 * k1 + 1, window - 2 * k2 + 1
     r = np.zeros(STOCHASTIC)
-    products[:] = 0.0
-    means[:] = 0.0
-    # Smooth in the lag on the scale of the shorter factor: a sum in steps, centred on the middle of both terms.
     step = max(1, min(k1, k2) // 32)
     centre = k1 - k2
     reach = min(2 * (k1 + k2), window)
@@ -85,24 +82,38 @@ def _sum_pairs(window, k1, k2, thin, logarithm, products, means):  # type: ignor
             means[a] += weight * r[a]
             for b in range(1, STOCHASTIC):
                 products[a, b] += weight * r[a] * r[b]
-    # White angle noise: at most nine lags, each counted once; thinned terms meet it `thin` times as often per pair.
-    for i in range(3):
-        for j in range(3):
-            lag = i * k1 - j * k2
-            seen = False
-            for p in range(3 * i + j):
-                seen = seen or lag == (p // 3) * k1 - (p % 3) * k2
-            weight = _weight(lag, n1, n2) * thin
-            if seen or weight == 0:
-                continue
-            _smooth(lag, k1, k2, logarithm, r)
-            r[0] = _quantization(lag, k1, k2)
-            means[0] += weight * r[0]
-            for b in range(STOCHASTIC):
-                products[0, b] += weight * r[0] * r[b]
-                if b > 0:
-                    products[b, 0] += weight * r[0] * r[b]
-    pairs = float(n1) * n2
+
+
+@njit(nogil=True, cache=True)
+def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type: ignore[no-untyped-def]
+    """Add the pairs of white angle noise with every term: at most nine lags, met `thin` times as often by thinned terms."""
+    n1, n2 = window - 2 * k1 + 1, window - 2 * k2 + 1
+    r = np.zeros(STOCHASTIC)
+    for p in range(9):
+        lag = (p // 3) * k1 - (p % 3) * k2
+        seen = False
+        for q in range(p):
+            seen = seen or lag == (q // 3) * k1 - (q % 3) * k2
+        weight = _weight(lag, n1, n2) * thin
+        if seen or weight == 0:
+            continue
+        _smooth(lag, k1, k2, logarithm, r)
+        r[0] = _quantization(lag, k1, k2)
+        means[0] += weight * r[0]
+        products[0, 0] += weight * r[0] * r[0]
+        for b in range(1, STOCHASTIC):
+            products[0, b] += weight * r[0] * r[b]
+            products[b, 0] += weight * r[0] * r[b]
+
+
+@njit(nogil=True, cache=True)
+def _sum_pairs(window, k1, k2, thin, logarithm, products, means):  # type: ignore[no-untyped-def]
+    """Products ``r_a r_b`` and values ``r_a`` averaged over all pairs of terms."""
+    products[:] = 0.0
+    means[:] = 0.0
+    _add_smooth(window, k1, k2, logarithm, products, means)
+    _add_quantization(window, k1, k2, thin, logarithm, products, means)
+    pairs = float(window - 2 * k1 + 1) * (window - 2 * k2 + 1)
     for a in range(STOCHASTIC):
         means[a] /= pairs
         for b in range(STOCHASTIC):

@@ -348,6 +348,37 @@ def _without(a, squares, design, trial):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
+def _spread(a, squares, design, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread):  # type: ignore[no-untyped-def]
+    """Covariance of the cells as a polynomial in the squared coefficient of term `a`: constant, linear and square parts."""
+    trial = np.empty(squares.size)
+    _without(a, squares, design, trial)
+    _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[0])
+    trial[a] = 1.0
+    _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[1])
+    trial[:] = 0.0
+    trial[a] = 1.0
+    _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[2])
+    for i in range(n):
+        for j in range(n):
+            spread[1, i, j] -= spread[0, i, j] + spread[2, i, j]
+
+
+@njit(nogil=True, cache=True)
+def _factorise(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, data, factor):  # type: ignore[no-untyped-def]
+    """Cholesky factor of the covariance of the valid cells; False when it is hopeless."""
+    n = data.size
+    jitter = 1e-7  # the sums over lags are good to about this; a strong ramp may need more
+    while jitter < 1.0:
+        _covariance(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, factor)
+        for i in range(n):  # the second part keeps a window without any noise solvable
+            factor[i, i] += jitter * factor[i, i] + 1e-16 * data[i] * data[i]
+        if _cholesky(factor, n):
+            return True
+        jitter *= 10.0
+    return False
+
+
+@njit(nogil=True, cache=True)
 def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, ramps, weight, allowed, result):  # type: ignore[no-untyped-def]
     """Fit one window; returns chi-square, degrees of freedom and the number of usable cells (arguments as `fit_windows`)."""
     index = np.empty(y.size, np.int64)
@@ -367,15 +398,7 @@ def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, r
     rest = data
     for _ in range(6):
         previous = squares.copy()
-        definite = False
-        jitter = 1e-7  # the sums over lags are good to about this; a strong ramp may need more
-        while not definite and jitter < 1.0:
-            _covariance(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, factor)
-            for i in range(n):  # the second part keeps a window without any noise solvable
-                factor[i, i] += jitter * factor[i, i] + 1e-16 * data[i] * data[i]
-            definite = _cholesky(factor, n)
-            jitter *= 10.0
-        if not definite:
+        if not _factorise(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, data, factor):
             return np.nan, 0, n
         normal, right, whitened, rest = _normal_equations(data, design, factor, n)
         chosen = solve_nonnegative(normal, right, allowed, squares)
@@ -386,23 +409,11 @@ def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, r
             break
     used = 0
     spread = np.empty((3, n, n))
-    trial = np.empty(terms)
     for a in range(terms):
-        if not allowed >> a & 1:
-            continue
-        used += chosen >> a & 1
-        _without(a, squares, design, trial)
-        _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[0])
-        trial[:] = 0.0
-        trial[a] = 1.0
-        _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[2])
-        _without(a, squares, design, trial)
-        trial[a] = 1.0
-        _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[1])
-        for i in range(n):
-            for j in range(n):
-                spread[1, i, j] -= spread[0, i, j] + spread[2, i, j]
-        _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, result)
+        if allowed >> a & 1:
+            used += chosen >> a & 1
+            _spread(a, squares, design, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread)
+            _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, result)
     chi2 = 0.0
     for i in range(n):
         misfit = rest[i]
