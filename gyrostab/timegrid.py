@@ -7,6 +7,7 @@ nanosecond as a float. 200 h at 300 Hz end on the right nanosecond, and the axis
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
@@ -166,7 +167,8 @@ class TimeGridIndex(CoordinateTransformIndex):
         def edge(bound: Any, side: str) -> int | None:
             if bound is None:
                 return None
-            stamp = pd.Period(bound).end_time if side == "right" and isinstance(bound, str) and len(bound) < 19 else pd.Timestamp(bound)
+            whole = side == "right" and isinstance(bound, str) and not re.search(r"(Z|[+-]\d\d:?\d\d)$", bound)
+            stamp = pd.Period(bound).end_time if whole else pd.Timestamp(bound)  # "T12:00:03" ends with that second
             stamp = stamp.tz_convert(None) if stamp.tzinfo else stamp
             guess = int(np.floor(self.transform.reverse({name: np.datetime64(stamp)})[dim])) - 1
             while guess < self.transform.size:  # at most three steps: the guess is off by rounding only

@@ -1,0 +1,55 @@
+"""Every unit spelling against UDUNITS or plain arithmetic."""
+
+from __future__ import annotations
+
+import cf_units
+import numpy as np
+import pytest
+
+from gyrostab.errors import UnitError
+from gyrostab.schema import VARIABLES
+from gyrostab.units import INNER, known_units, on_disk, parse_unit
+
+
+@pytest.mark.parametrize(
+    ("text", "udunits"),
+    [
+        ("deg/h", "degree hour-1"), ("deg/s", "degree s-1"), ("rad/s", "radian s-1"), ("mrad/s", "1e-3 radian s-1"),
+        ("urad/s", "1e-6 radian s-1"), ("nrad/s", "1e-9 radian s-1"), ("arcsec/s", "arcsecond s-1"), ("rpm", "6 degree s-1"),
+        ("rad s^-1", "radian s-1"), ("0.1 arcsec/s", "0.1 arcsecond s-1"), ("deg", "degree"), ("arcsec", "arcsecond"),
+        ("rad", "radian"), ("degC", "degree_Celsius"), ("K", "kelvin"), ("degF", "degree_Fahrenheit"), ("g", "9.80665 m s-2"),
+        ("m/s^2", "m s-2"), ("m s^-2", "m s-2"), ("mg", "9.80665e-3 m s-2"), ("mV", "mV"), ("uW", "uW"), ("psi", "psi"), ("bar", "bar"),
+        ("uT", "uT"), ("G", "1e-4 T"),
+    ],
+)  # fmt: skip
+def test_conversion_agrees_with_udunits(text, udunits):
+    unit = parse_unit(text)
+    inner = cf_units.Unit(on_disk(INNER[unit.quantity]))
+    for value in (0.0, 1.0, -37.5):
+        assert value * unit.factor + unit.offset == pytest.approx(cf_units.Unit(udunits).convert(value, inner), rel=1e-9, abs=1e-9)
+
+
+def test_every_unit_we_write_is_read_by_udunits_as_it_is_meant():
+    for name, attributes in VARIABLES.items():
+        if "units" in attributes:
+            unit = cf_units.Unit(attributes["units"])
+            assert not unit.is_unknown(), name
+    hour, degree = 3600.0, np.pi / 180
+    for text, value in (("degree2 hour-1", degree**2 / hour), ("degree2 hour-3", degree**2 / hour**3), ("degree hour-2", degree / hour**2)):
+        assert cf_units.Unit(text).convert(1.0, cf_units.Unit(text.replace("degree", "radian").replace("hour", "s"))) == pytest.approx(
+            value
+        )
+
+
+@pytest.mark.parametrize("text", ["furlong/fortnight", "deg//h", "0 deg/h", "nan deg/h", "1e400 deg/h"])
+def test_what_is_not_a_unit_is_refused_with_what_is(text):
+    with pytest.raises(UnitError):
+        parse_unit(text)
+    with pytest.raises(UnitError, match="deg/h, arcsec/s"):
+        parse_unit("quux")
+
+
+def test_known_units_lists_the_contract():
+    listed = known_units("rate")
+    for text in ("deg/h", "deg/s", "rad/s", "mrad/s", "urad/s", "nrad/s", "arcsec/s", "rpm"):
+        assert text in listed
