@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gyrostab.channels import window_channels
 from gyrostab.errors import OptionError
-from gyrostab.kernels.covariance import pair_products, ramp_products
+from gyrostab.kernels.covariance import diagonal_products
 from gyrostab.kernels.least_squares import identify_noise
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_theta
@@ -210,9 +210,7 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
     to_samples = sample_squares(rate)
     n = [int(unit.window - 2 * k + 1) for k in unit.ks]
     weight = np.array([count**2 / white_pair_sum(count, int(k)) for count, k in zip(n, unit.ks, strict=True)])
-    one = [(unit.ks[i : i + 1], unit.shifts[i : i + 1]) for i in range(unit.ks.size)]
-    pairs = np.stack([pair_products(unit.window, k, s)[:, :, 0, 0] for k, s in one], axis=-1)
-    ramps = np.stack([ramp_products(unit.window, k, s)[:, 0, 0] for k, s in one], axis=-1)
+    pairs, ramps = diagonal_products(unit.window, unit.ks, unit.shifts)
     return columns, weight, to_samples, pairs, ramps
 
 

@@ -115,11 +115,11 @@ def _fit_gls(surface: xr.Dataset, allowed: int) -> xr.Dataset:
         return _fit_block(flat, tables, allowed).reshape(arrays[0].shape[0], arrays[0].shape[1], -1)
 
     width = len(TERMS) * 4 + 2 + chosen.size
-    if isinstance(cells[0], da.Array):
-        whole = [cell.rechunk({2: -1}) for cell in cells]
-        fitted = da.map_blocks(block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64)
-    else:
-        fitted = block(*cells)
+    lazy = isinstance(cells[0], da.Array)
+    whole = [cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1)) for cell in cells]
+    fitted = da.map_blocks(block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64)
+    if not lazy:
+        fitted = fitted.compute()
     parts = [fitted[..., i] for i in range(width)]
     n = len(TERMS)
     out = _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)))

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["STOCHASTIC", "pair_products", "ramp_products"]
+__all__ = ["STOCHASTIC", "diagonal_products", "pair_products", "ramp_products"]
 
 #: Number of stochastic terms: quantization, angle random walk, bias instability, rate random walk.
 STOCHASTIC = 4
@@ -167,6 +167,27 @@ def ramp_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64])
     _, means = _tables(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
     factors = np.asarray(ks, dtype=np.float64)
     return np.asarray(2.0 * factors[:, None] * factors[None, :] * means)
+
+
+@njit(nogil=True, cache=True)
+def _diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
+    products = np.zeros((STOCHASTIC, STOCHASTIC, ks.size))
+    means = np.zeros((STOCHASTIC, ks.size))
+    one = np.empty((STOCHASTIC, STOCHASTIC))
+    mean = np.empty(STOCHASTIC)
+    for i in range(ks.size):
+        _sum_pairs(window, ks[i], ks[i], 1 << shifts[i], logarithm, one, mean)
+        for a in range(STOCHASTIC):
+            means[a, i] = mean[a]
+            for b in range(STOCHASTIC):
+                products[a, b, i] = one[a, b]
+    return products, means
+
+
+def diagonal_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Diagonals of `pair_products`, shape (4, 4, n_tau), and of `ramp_products`, shape (4, n_tau), without the rest."""
+    products, means = _diagonals(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
+    return np.asarray(2.0 * products), np.asarray(2.0 * np.asarray(ks, dtype=np.float64) ** 2 * means)
 
 
 def _logarithms(window: int) -> NDArray[np.float64]:
