@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo-output
 
-.PHONY: demo test lint bench real-recordings clean help
+.PHONY: demo test lint bench real-recordings clean-kernels clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
@@ -40,5 +40,8 @@ bench: $(VENV)/.installed-test  ## time the kernels beside their peers
 real-recordings: $(VENV)/.installed  ## remake docs/real-recordings.md from the recordings, where they are present
 	$(BIN)/python pipelines/real_recordings.py
 
-clean:  ## remove what the targets made
+clean-kernels:  ## forget the compiled kernels
+	find gyrostab -name '*.nb[ic]' -delete
+
+clean: clean-kernels  ## remove what the targets made
 	rm -rf $(VENV) $(OUT)

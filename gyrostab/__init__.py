@@ -18,6 +18,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gyrostab.confidence import confidence_interval as confidence_interval
     from gyrostab.davar import davar as davar
     from gyrostab.export import open_log as open_log
     from gyrostab.export import open_product as open_product
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 # public name -> module that holds it
 _HOME = {
+    "confidence_interval": "confidence",
     "davar": "davar",
     "fit_noise": "fit",
     "gap_table": "regularise",
@@ -61,6 +63,7 @@ _HOME = {
 
 __all__ = [
     "__version__",
+    "confidence_interval",
     "davar",
     "fit_noise",
     "gap_table",

@@ -85,7 +85,7 @@ class Windows:
     tau_max
         Longest averaging time (default: a third of the window; at most half of it).
     overlap
-        full uses every second difference; octave thins them out where tau is long: three times faster, 1 % more scatter.
+        full uses every second difference; octave thins them out where tau is long: faster on long windows, 1 % more scatter.
     gaps
         bridge counts only what is there; zero divides by the gap-free number, as some papers do, which digs a canyon at every gap.
     axis
