@@ -1,0 +1,80 @@
+"""Take every recording of real_recordings.toml through gyrostab, and write what is found there as a page."""
+
+import os
+import shlex
+import tempfile
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+import gyrostab
+from gyrostab.errors import GyrostabError
+from gyrostab.units import parse_unit
+
+ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+
+
+def pick(value, log, product):
+    """Pick numbers of the log or the product: by name, axis, averaging time, stretch of time, level of a channel."""
+    if value["of"] == "gaps":
+        return gyrostab.gap_table(log).loc[lambda gaps: gaps["cause"] == value["cause"], value["column"]]
+    if value["of"] == "published":
+        table = pd.read_csv(value["file"]).query(value["rows"]).sort_values(["channel", "haar_scale_s"])
+        return np.abs(product["avar"].values.ravel() / (2 * table["haar_wavelet_variance"] * parse_unit("deg/s").factor ** 2) - 1)
+    numbers = {**log, **product, "adev": np.sqrt(product["avar"].sel(tau=value.get("tau", 1.0), method="nearest"))}[value["of"]]
+    numbers = numbers.sel(axis=value["axis"]) if "axis" in value else numbers
+    seconds = (numbers["time"] - log["time"][0]) / np.timedelta64(1, "s")
+    numbers = numbers[(seconds >= value.get("from", 0)) & (seconds <= value.get("to", np.inf))]
+    return numbers[log[value["where"]] > value["above"] * log[value["where"]].max()] if "where" in value else numbers
+
+
+def examine(entry, file):
+    """Go from the log to a product on disk and back, and compute every number that the text speaks of."""
+    log = gyrostab.regularise(gyrostab.read_log(entry["files"], **entry["read"]))
+    gyrostab.to_netcdf(gyrostab.fit_noise(gyrostab.davar(log, **entry["davar"])), file)
+    product = gyrostab.open_product(file).load()
+    found = {"hertz": log.attrs["sampling_rate_hz"], "minutes": np.ptp(log["time"].values) / np.timedelta64(1, "m")}
+    found["missing"] = float(log["rate"].isnull().mean())
+    for name, value in entry["values"].items():
+        numbers = np.divide(*map(found.get, value["ratio"])) if "ratio" in value else np.asarray(pick(value, log, product))
+        scale = value.get("times", 1.0) / (parse_unit(value["unit"]).factor if "unit" in value else 1.0)
+        found[name] = float(getattr(np, value.get("over", "nanmedian"))(numbers)) * scale
+    return log, product, found
+
+
+def refusal(entry):
+    """Tell what gyrostab answers when it is told nothing about the log."""
+    try:
+        return f"{gyrostab.read_log(entry['files']).sizes['row']} rows"
+    except GyrostabError as error:
+        return str(error)
+
+
+def command(entry):
+    """Write the same job as a line for the shell."""
+    words = ["gyrostab", "run", *entry["files"], "-o", "product.nc"]
+    for option, given in {**entry["read"], **entry["davar"]}.items():
+        texts = [f"{key}={text}" for key, text in given.items()] if isinstance(given, dict) else np.atleast_1d(given)
+        words += [word for text in texts for word in (f"--{option.replace('_', '-')}", str(text))]
+    return shlex.join(words)
+
+
+def describe(name, entry, folder):
+    """Process one recording; a row of the table and a section of the page."""
+    log, product, found = examine(entry, Path(folder, f"{name}.nc"))
+    notes = "".join(f"- {note}\n" for note in log.attrs["notes"] if not any(words in note for words in PLAN["page"]["usual"]))
+    if "figure" in entry:
+        gyrostab.plot_davar(product, axis=entry["figure"]).savefig(ROOT / "docs" / "figures" / f"{name}.png", dpi=70)
+    about = {**entry, **entry["davar"], **found, "name": name, "axes": ", ".join(log["axis"].values), "gaps": log.sizes["gap"]}
+    about |= {"text": entry["text"].format_map(found | {"refusal": refusal(entry)}), "command": command(entry), "notes": notes}
+    return PLAN["page"]["row"].format_map(about), PLAN["page"]["section"].format_map(about)
+
+
+if __name__ == "__main__":
+    os.chdir(os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings"))
+    with tempfile.TemporaryDirectory() as folder:
+        rows, sections = zip(*[describe(name, entry, folder) for name, entry in PLAN["recording"].items()], strict=True)
+    page = PLAN["page"]["head"].format(rows="\n".join(rows), sections="\n".join(sections))
+    (ROOT / "docs" / "real-recordings.md").write_text(page, encoding="utf-8")
