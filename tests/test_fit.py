@@ -171,6 +171,18 @@ def test_the_fit_of_deviations_of_the_2015_paper_is_not_additive():
     assert abs(float(paper["K"][0, 0]) / truth["K"] - 1) > 0.03
 
 
+def test_averaging_times_below_a_disturbance_can_be_left_out():
+    """A tone at 5 Hz spoils tau below a second and with it N; from 2 s on the noise is as it was."""
+    t = np.arange(300_000) / RATE
+    x = white(np.random.default_rng(17), 1, t.size, N=0.01, rate=RATE)[0] + 40 * np.sin(2 * np.pi * 5.013 * t)
+    surface = davar(make_log(x, rate=RATE, unit="deg/h"), window=100_000, step=100_000)
+    spoiled, clean = fit_noise(surface), fit_noise(surface, tau_min="5s")
+    assert abs(float(clean.N.mean()) / 0.01 - 1) < 0.2
+    assert abs(float(spoiled.N.mean()) / 0.01 - 1) > 0.5
+    with pytest.raises(OptionError, match="no averaging time"):
+        fit_noise(surface, tau_min="2h")
+
+
 def test_window_without_data_is_said_to_see_nothing():
     x = np.random.default_rng(10).standard_normal((3, 1000))
     x[1] = np.nan
