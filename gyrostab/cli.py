@@ -5,7 +5,10 @@ Exit codes: 0 done; 2 bad input or usage, with one message on stderr; 3 interrup
 
 from __future__ import annotations
 
+import errno
+import signal
 import sys
+import threading
 import tomllib
 import warnings
 from collections.abc import Iterator, Sequence
@@ -426,6 +429,26 @@ def _notes() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def _stoppable() -> Iterator[None]:
+    """Let a polite ``kill``, a time limit or a closed terminal end the work as Ctrl-C does, with nothing left behind."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    ours = [number for number in signals if signal.getsignal(number) is signal.SIG_DFL]  # not under nohup
+    if threading.current_thread() is not threading.main_thread():
+        ours = []
+    for number in ours:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
+
+
 def _complain(text: str, code: int) -> int:
     print(f"gyrostab: {text}", file=sys.stderr)
     return code
@@ -453,7 +476,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in tokens
     try:
         app.config = _config(tokens)
-        with _notes():
+        with _notes(), _stoppable():
             app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     except KeyboardInterrupt:
         return _complain("interrupted; nothing was written under the name of the output. Start the same command again.", 3)
@@ -475,6 +498,9 @@ def _explain(error: Exception) -> int:
         return _complain(str(error), 2)
     if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError) and error.filename:
         return _complain(f"{error.filename}: {error.strerror}", 2)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        where = error.filename or "the standard output"
+        return _complain(f"{where}: cannot be written ({error.strerror}); make room, or write elsewhere", 2)
     if isinstance(error, MemoryError):
         return _complain(f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers", 1)
     return _complain(f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.", 1)

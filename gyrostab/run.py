@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -53,6 +54,10 @@ def check_output(path: str | Path, *, suffixes: Sequence[str] = (), overwrite: b
         raise OptionError(f"output {str(path)!r} must end in {' or '.join(suffixes)}; give another name with -o")
     if any(Path(item).resolve() == path.resolve() for item in inputs):
         raise OptionError(f"output {str(path)!r} is also an input and would be destroyed; give another name with -o")
+    if path.is_dir() and path.suffix.lower() != ".zarr":
+        raise OutputError(f"output {str(path)!r} is a directory; give another name with -o")
+    if path.is_file() and path.suffix.lower() == ".zarr":
+        raise OutputError(f"output {str(path)!r} is a file, and Zarr needs a directory; give another name with -o")
     if path.exists() and not overwrite:
         raise OutputError(f"output {str(path)!r} exists already; give --overwrite to replace it, or another name with -o")
     try:
@@ -86,9 +91,19 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
     log = read_log(paths, **reading)
     if "sampling_rate_hz" not in log.attrs:
         log = regularise(log, rate=reading.get("rate"), max_gap=max_gap)
+        said = "; ".join(f"{name}: {_said(value)}" for name, value in reading.items() if value)
+        if said:
+            log.attrs["history"] += f" (read with {said})"
     for note in log.attrs.get("notes", []):
         warnings.warn(note, stacklevel=2)
     return log
+
+
+def _said(value: Any) -> str:
+    """An option in one line."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{left}={right}" for left, right in value.items())
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau_max: str | None = None, **other: Any) -> None:
@@ -102,7 +117,7 @@ def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau
     Raises
     ------
     OptionError
-        When one of them is no length of time, or the step is longer than the window.
+        When one of them is no length of time, or the step or an averaging time is too long for the window.
 
     Examples
     --------
@@ -110,17 +125,24 @@ def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau
     Traceback (most recent call last):
     gyrostab.errors.OptionError: window '10' has no unit; write for instance 10s, 10min or 10samples
     """
-    from gyrostab.windows import duration_seconds, samples
+    from gyrostab.windows import averaging_factors, duration_seconds, samples
 
     fine = 1e6  # Hz; the true rate is not known yet
     length, hop = samples(window, fine, "window"), samples(step, fine, "step") if step else 1
     if step and ("sample" in window) == ("sample" in step) and hop > length:
         raise OptionError(f"the step of {step} is longer than the window of {window}, so samples would be left out; give a shorter --step")
-    if taus.strip() not in ("octave", "all") and not taus.strip().isdigit():
-        for part in taus.split(","):
-            duration_seconds(part, "tau")
-    if tau_max:
-        duration_seconds(tau_max, "tau_max")
+    half = None if "sample" in window else length / fine / 2  # how long a number of samples is depends on the rate
+    given = [tau_max] if tau_max else []
+    if taus.strip().isdigit():
+        averaging_factors(taus, rate=fine, window=2)
+    elif taus.strip() not in ("octave", "all"):
+        given += taus.split(",")
+    for tau in given:
+        if duration_seconds(tau, "tau") > (half or math.inf):
+            raise OptionError(
+                f"tau {tau.strip()} is longer than half of the window of {window}, so no second difference fits; "
+                "give a longer --window or a shorter tau"
+            )
 
 
 def samples_of(log: xr.Dataset) -> int:

@@ -16,8 +16,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from gyrostab.__main__ import main as start
 from gyrostab.cli import app, main
-from gyrostab.export import open_log, open_product, open_surface
+from gyrostab.errors import OutputError
+from gyrostab.export import open_log, open_product, open_surface, to_netcdf
+from gyrostab.read.buffers import Buffers
+from gyrostab.run import load_log
 
 COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "report")
 RATE = 100
@@ -84,6 +88,19 @@ def _existing_output(folder: Path) -> list[object]:
     return [write_log(folder / "good.csv"), "-o", folder / "out.nc", *WINDOW]
 
 
+def _folder(path: Path) -> Path:
+    path.mkdir()
+    return path
+
+
+def _damaged_log(folder: Path) -> list[object]:
+    to_netcdf(load_log([write_log(folder / "good.csv")]), folder / "bad.nc")
+    whole = bytearray((folder / "bad.nc").read_bytes())
+    whole[len(whole) // 2 : len(whole) // 2 + 200] = b"\xff" * 200
+    (folder / "bad.nc").write_bytes(bytes(whole))
+    return [folder / "bad.nc", "-o", folder / "out.nc", *WINDOW]
+
+
 def _unwritable_folder(folder: Path) -> list[object]:
     if os.geteuid() == 0:  # nothing is forbidden to root but what the kernel itself refuses
         return [write_log(folder / "good.csv"), "-o", "/proc/out.nc", *WINDOW]
@@ -116,6 +133,12 @@ BAD_INPUT = {
     "window longer than the record": (_bad_log("--window", "2min", "--step", "10s"), "window"),
     "step longer than the window": (_bad_log("--window", "10s", "--step", "20s"), "step"),
     "tau longer than the window": (_bad_log("--window", "20s", "--step", "5s", "--taus", "1s,30s"), "tau|30"),
+    "all averaging times too long": (_bad_log("--window", "20s", "--tau-max", "15s"), "15s.*half of the window of 20s"),
+    "output is a directory": (
+        lambda folder: [write_log(folder / "good.csv"), "-o", _folder(folder / "out.nc"), "--overwrite"],
+        "out.nc' is a directory",
+    ),
+    "damaged log of ours": (_damaged_log, r"bad\.nc: is damaged"),
     "window without a unit": (_bad_log("--window", "20", "--step", "5s"), "window|20"),
     "window that is no duration": (_bad_log("--window", "long"), "long"),
     "axis that is not there": (_bad_log("--axis", "w", *WINDOW), "axis|'w'"),
@@ -162,6 +185,29 @@ def test_disk_full_while_writing(tmp_path):
     assert "log.nc" in done.stderr
     assert "Traceback" not in done.stderr
     assert [entry.name for entry in tmp_path.iterdir()] == ["tool.csv"]
+
+
+def test_full_standard_output_is_explained(log):
+    if not Path("/dev/full").exists():
+        pytest.skip("this system has no /dev/full")
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([sys.executable, "-m", "gyrostab", "scan", str(log)], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert "the standard output: cannot be written" in done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_no_room_for_the_columns_of_a_long_log(monkeypatch):
+    full = Path("/dev/full").open("wb")  # noqa: SIM115
+    monkeypatch.setattr("gyrostab.read.buffers.tempfile.TemporaryFile", lambda **options: full)
+    with pytest.raises(OutputError, match=r"cannot be written.*TMPDIR"):
+        Buffers({0: np.float64}, limit=100).add({0: np.zeros(1000)})
+
+
+def test_the_reading_options_stand_in_the_history(log, tmp_path):
+    assert call("ingest", log, "-o", tmp_path / "log.nc", "--epoch", "2026-03-01", "--map", "gyro_y=-") == 0
+    with open_log(tmp_path / "log.nc") as stored:
+        assert "(read with epoch: 2026-03-01; map: gyro_y=-)" in stored.attrs["history"]
 
 
 def test_constant_signal_runs_with_a_note(tmp_path, capfd):
@@ -315,7 +361,17 @@ def test_interrupt_is_exit_code_3(log, tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_real_interrupt_leaves_nothing_behind(tmp_path):
+def test_an_interrupt_while_the_program_loads_is_exit_code_3(monkeypatch, capsys):
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gyrostab.cli.main", interrupted)
+    assert start() == 3
+    assert "interrupted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
     path = write_log(tmp_path / "long.csv")
     code = (
         "import os, signal, sys, xarray\n"
@@ -323,7 +379,7 @@ def test_a_real_interrupt_leaves_nothing_behind(tmp_path):
         "write = xarray.Dataset.to_netcdf\n"
         "def slow(dataset, target, **options):\n"
         "    written = write(dataset, target, **options)\n"
-        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        f"    os.kill(os.getpid(), signal.{name})\n"
         "    return written\n"
         "xarray.Dataset.to_netcdf = slow\n"
         f"sys.exit(main(['ingest', {str(path)!r}, '-o', {str(tmp_path / 'log.nc')!r}]))"

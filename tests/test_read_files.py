@@ -61,7 +61,7 @@ def test_patterns_and_repeated_paths(pair: list[Path]) -> None:
         read_log([])
     with pytest.raises(FormatError, match=r"no reader takes this file with the suffix '.xyz'.*text"):
         read_log(write(folder / "log.xyz", "?"))
-    with pytest.raises(FormatError, match="no reader takes this directory"):
+    with pytest.raises(FormatError, match=r"no reader takes this directory; name the files in it, for instance .*\*\.csv"):
         read_log(folder)
 
 
@@ -71,6 +71,65 @@ def test_many_files_wait_on_disk(pair: list[Path], monkeypatch: pytest.MonkeyPat
     raw = read_log(pair)
     assert raw.rate.chunks is not None
     xr.testing.assert_identical(raw.compute(), expected)
+
+
+def _rows(values: np.ndarray, rows: slice | np.ndarray) -> str:
+    return "".join(f"{n},{values[n]:.3f},{-values[n]:.3f},\n" for n in np.arange(len(values))[rows])
+
+
+@pytest.fixture
+def values() -> np.ndarray:
+    return np.random.default_rng(4).normal(size=60)
+
+
+@pytest.mark.parametrize("spilled", [False, True])
+@pytest.mark.parametrize(
+    "pieces",
+    [
+        [slice(0, 30), slice(20, 60)],
+        [slice(40, 60), slice(0, 25), slice(22, 45)],
+        [slice(0, 60), slice(10, 20), slice(30, 60)],
+        [slice(0, 60), slice(0, 60)],
+        [np.r_[0:20, 25:30], slice(15, 60)],  # the earlier file has lost rows that the later one has
+        [slice(0, 30), np.r_[15:20, 24:60]],  # and the other way round
+        [slice(5, 30), slice(5, 60), slice(0, 10)],
+    ],
+)
+def test_rows_that_two_files_hold_count_once(
+    tmp_path: Path, values: np.ndarray, pieces: list, spilled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = read_log(write(tmp_path / "whole.csv", HEADER + _rows(values, slice(None))))
+    if spilled:
+        monkeypatch.setattr(files, "SPILL_BYTES", 100)
+    paths = [write(tmp_path / f"{place}.csv", HEADER + _rows(values, piece)) for place, piece in enumerate(pieces)]
+    raw = read_log(paths)
+    np.testing.assert_array_equal(raw.time, whole.time)
+    np.testing.assert_array_equal(raw.rate, whole.rate)
+    assert any("and were left out here" in note or "that file was left out" in note for note in raw.attrs["notes"])
+    assert len(raw.attrs["row_start"]) == len(raw.attrs["source_files"])
+
+
+def test_a_copy_in_another_unit_and_with_damage_is_a_copy(tmp_path: Path, values: np.ndarray) -> None:
+    first = write(tmp_path / "a.csv", HEADER + _rows(values, slice(None)))
+    rows = "".join(f"{n * 1000},{'****' if n == 7 else f'{value / 3600:.12g}'}\n" for n, value in enumerate(np.round(values, 3)))
+    second = write(tmp_path / "b.csv", "time [ms],gyro_x [deg/s]\n" + rows)
+    raw = read_log([first, second])
+    np.testing.assert_array_equal(raw.rate, read_log(first).rate)
+    assert any(note.startswith("a.csv: all 60 rows of b.csv are here too") for note in raw.attrs["notes"])
+
+
+def test_a_clock_that_begins_again_in_the_next_file_is_no_overlap(tmp_path: Path, values: np.ndarray) -> None:
+    first = write(tmp_path / "a.csv", HEADER + _rows(values, slice(None)))
+    second = write(tmp_path / "b.csv", HEADER + _rows(values[::-1], slice(None)))
+    raw = read_log([first, second])
+    assert raw.sizes["row"] == 120
+    np.testing.assert_array_equal(raw.rate[0, 60:], np.round(values[::-1], 3))
+
+
+@pytest.mark.parametrize("name", ["tool.d01", "noending", "TOOL.CSV"])
+def test_text_is_read_whatever_its_name_is(pair: list[Path], name: str) -> None:
+    other = pair[0].rename(pair[0].with_name(name))
+    np.testing.assert_array_equal(read_log(other).rate, [[1, 3, np.nan], [2, 4, 5]])
 
 
 def test_files_without_stamps_keep_their_order_and_do_not_mix(tmp_path: Path) -> None:

@@ -264,6 +264,38 @@ def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
         read_log(cut)
 
 
+@pytest.mark.parametrize("suffix", [".parquet", ".mat"])
+def test_damage_in_the_midst_of_the_data_is_no_fault_of_ours(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"log{suffix}"
+    noise = np.random.default_rng(2).normal(size=50_000)
+    if suffix == ".parquet":
+        table = pa.table({"time [s]": np.arange(50_000) * 0.01, "gyro_x [deg/h]": noise})
+        parquet.write_table(table, path, row_group_size=5000)
+    else:
+        with h5py.File(path, "w") as file:
+            file.create_dataset("time", data=np.arange(50_000) * 0.01)
+            file.create_dataset("gyro_x", data=noise, chunks=(1000,), compression="gzip")
+    whole = bytearray(path.read_bytes())
+    place = int(0.8 * len(whole))
+    whole[place : place + 300] = b"\xff" * 300
+    path.write_bytes(bytes(whole))
+    given = {} if suffix == ".parquet" else {"time": "s", "gyro": "deg/h"}
+    with pytest.raises(FormatError, match=rf"log{suffix}: is damaged .*copy it again"):
+        read_log(path, unit=given)
+
+
+def test_plain_hdf5_with_units_as_attributes(tmp_path: Path) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        for name, data, units in (("time", [0.0, 0.5, 1.0], "s"), ("gyro_x", [1.0, 2.0, 3.0], "deg/s")):
+            file[name] = np.array(data)
+            file[name].attrs["units"] = units
+    raw = read_log(path)
+    np.testing.assert_array_equal(raw.rate[0], [3600.0, 7200.0, 10800.0])
+    assert raw.time.values[1] == np.datetime64(500, "ms")
+    assert scan_file(path).format == "hdf5"
+
+
 def test_a_matlab_file_of_words_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "words.mat"
     savemat(path, {"note": "hello", "scalar": 4.0})

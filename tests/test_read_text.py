@@ -346,11 +346,18 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
         ("time [s],gyro_x [deg/h],Gyro_X [deg/s]\n0,1,1\n1,2,1\n", {}, FormatError, r"2 columns are called 'gyro_x'"),
         ("gyro_x [deg/h]\n1\n2\n", {}, OptionError, r"no time column.*--rate HZ"),
         ("t_s,gx_dps,gy_dps\n0,1,1\n1,2,1\n", {}, FormatError, r"Columns: t_s, gx_dps, gy_dps.*gx_dps=gyro_x\" --unit gyro=deg/s"),
-        ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"map": {"wx": "gyro_y"}}, OptionError, r"--map wx: no such column in log.csv"),
+        (
+            "time [s],gyro_x [deg/h]\n0,1\n1,2\n",
+            {"map": {"wx": "gyro_y"}},
+            OptionError,
+            r"--map wx: no such column in log.csv; the columns are time \[s\], gyro_x \[deg/h\]",
+        ),
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"unit": {"gryo": "deg/s"}}, OptionError, r"--unit gryo: no such column"),
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"rate": -1.0}, OptionError, r"above 0"),
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"kind": "speed"}, OptionError, r"'rate'.*'angle'"),
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"epoch": "long ago"}, OptionError, r"--epoch 'long ago'"),
+        ("time [s],gyro_x\n0,1\n1,2\n", {"unit": {"gyro": "0 deg/s"}}, UnitError, r"'gyro_x': .*the factor 0 is not usable"),
+        ("time [s],temperature [degC]\n0,1\n1,2\n", {}, FormatError, r'no gyro column.*--map "NAME=gyro_x"'),
         (b"", {}, FormatError, r"log.csv: the file is empty"),
         (b"\n\n  \n", {}, FormatError, r"empty"),
         ("# only\n# comments\n", {}, FormatError, r"only 2 blank or comment lines"),
@@ -409,6 +416,15 @@ def test_a_stray_quote_swallows_no_rows(tmp_path: Path) -> None:
     raw = read_log(write(tmp_path, "time [s],gyro_x [deg/h],remark\n" + rows))
     assert ns(raw) == [n * 10**9 for n in range(20)]
     assert raw.attrs["unreadable_rows"] <= 1
+
+
+@pytest.mark.parametrize("junk", [bytes(4096), bytes(range(256)) * 20, bytes(100) + b'"'])
+def test_junk_in_the_midst_of_a_log_spoils_single_rows(tmp_path: Path, junk: bytes) -> None:
+    rows = [f"{n},{n}\n".encode() for n in range(2000)]
+    raw = read_log(write(tmp_path, PLAIN.encode() + b"".join(rows[:1000]) + junk + b"\n" + b"".join(rows[1000:])))
+    good = np.isfinite(raw.rate[0].values)
+    assert set(raw.rate[0].values[good]) == set(range(2000))
+    assert 1 <= raw.attrs["unreadable_rows"] <= 1 + 2 * junk.count(b"\n")
 
 
 @pytest.mark.parametrize("keep", [0.02, 0.5, 0.99])

@@ -485,3 +485,13 @@ def test_stamps_coarser_than_the_jitter_of_a_sample(rate, n):
     assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-4 if n < 10_000 else 1e-6)
     assert np.isfinite(log.rate.values).sum() > 0.98 * len(samples)
     assert abs(log.sizes["time"] - 1 - samples[-1]) <= 1
+
+
+def test_a_channel_of_another_day_is_told():
+    raw = raw_log(stamps_of(np.arange(100), 10.0))
+    for day, told in ((0, False), (3, True)):
+        stamps = raw.time.values[:5] + np.timedelta64(day, "D")
+        other = raw.assign_coords(time_temperature=("time_temperature", stamps)).assign(
+            temperature=("time_temperature", np.full(5, 20.0), {"units": "degree_Celsius"})
+        )
+        assert any("channel temperature: none of its 5 values" in note for note in regularise(other).attrs["notes"]) is told

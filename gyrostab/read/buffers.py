@@ -10,6 +10,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.errors import OutputError
+
 __all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "lazily", "park"]
 
 #: Columns of one file together stay in memory up to this size [bytes].
@@ -46,7 +48,7 @@ class Buffers:
             if key not in self._files:
                 self._files[key] = tempfile.TemporaryFile(prefix="gyrostab-")  # noqa: SIM115
             for part in parts:
-                self._files[key].write(part.data)
+                _write(self._files[key], part)
             parts.clear()
 
     def finish(self) -> dict[Any, NDArray[Any]]:
@@ -55,9 +57,23 @@ class Buffers:
             return {key: np.concatenate(parts) if parts else np.empty(0, self.dtypes[key]) for key, parts in self._parts.items()}
         columns: dict[Any, NDArray[Any]] = {}
         for key, file in self._files.items():
-            file.flush()
+            _write(file)
             columns[key] = np.memmap(file, dtype=self.dtypes[key], mode="r+", shape=(self.rows,))
         return columns
+
+
+def _write(file: IO[bytes], *arrays: NDArray[Any]) -> None:
+    """Append arrays to a temporary file and bring it up to date."""
+    try:
+        for values in arrays:
+            file.write(values.data)
+        file.flush()
+    except OSError as error:
+        where = tempfile.gettempdir()
+        raise OutputError(
+            f"{where}: the columns of a long log are kept there while it is read, and cannot be written ({error.strerror}); "
+            "make room, or name a larger place in the environment variable TMPDIR"
+        ) from error
 
 
 class _Mapped:
@@ -84,6 +100,5 @@ def lazily(values: NDArray[Any]) -> Any:
 def park(values: NDArray[Any]) -> Any:
     """Move an array from memory to an unlinked temporary file and wrap it as a dask array."""
     with tempfile.TemporaryFile(prefix="gyrostab-") as file:
-        file.write(np.ascontiguousarray(values).view(np.int64).data)
-        file.flush()
+        _write(file, np.ascontiguousarray(values).view(np.int64))
         return lazily(np.memmap(file, dtype=values.dtype, mode="r+", shape=values.shape))

@@ -279,7 +279,10 @@ class _Work:
             return None
         try:
             unit = parse_unit(text)
-        except UnitError:
+        except UnitError as error:
+            if "factor" in str(error):
+                self.problems.append(UnitError(f"{self.path.name}: column {column.header!r}: {error}"))
+                return None
             hint = f'known are {known_units("rate")}; give it with --unit {stem}={example}, or with a factor --unit "{stem}=0.1 arcsec/s"'
             self.problems.append(UnitError(f"{self.path.name}: column {column.header!r}: unit {text!r} is not known; {hint}"))
             self._summarise(column, column.low, "gyro", None, text)
@@ -398,7 +401,8 @@ def _listing(names: Sequence[str], most: int = 30) -> str:
 
 def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     names = [split_header(header)[0] for header in headers if header.strip()]
-    likely = next((name for pattern in _LOOKS_GYRO for name in names if pattern.search(name)), names[0] if names else "NAME")
+    free = [name for name in names if not _TIME.match(name.lower()) and name.lower().split("_")[0] not in _QUANTITIES]
+    likely = next((name for pattern in _LOOKS_GYRO for name in free if pattern.search(name)), free[0] if free else "NAME")
     low = next((header for header in headers if likely in header), likely).lower()
     hour = re.search(r"deg_?(per_?|/)?h|dph", low)
     unit = "deg/h" if hour else "rad/s" if "rad" in low else "deg/s"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.read.buffers import park
+from gyrostab.read.overlap import drop_repeats
 from gyrostab.schema import SIGNAL_UNITS
 
 __all__ = ["attach_channels", "concatenate", "memory", "to_disk"]
@@ -27,7 +28,7 @@ def to_disk(part: xr.Dataset) -> xr.Dataset:
 
 
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Join the raw logs of several files along ``row``, in the order of their first stamps.
+    """Join the raw logs of several files along ``row``, in the order of their first stamps; rows that two files hold count once.
 
     Raises
     ------
@@ -42,7 +43,10 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         joined = parts[0]
     else:
         ordered = _in_order(parts)
-        joined = _join(ordered, _signal(ordered))
+        signal = _signal(ordered)
+        if "time" in ordered[0].variables:
+            ordered = drop_repeats(ordered)
+        joined = _join(ordered, signal)
     if joined.sizes["row"] < 2:
         name = joined.attrs["source_files"][0]
         raise FormatError(f"{name}: there is one row of data only; a log needs two at least")

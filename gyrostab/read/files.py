@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import entry_points
@@ -12,7 +13,7 @@ from typing import Any, Protocol, cast
 
 import xarray as xr
 
-from gyrostab.errors import FormatError, OptionError
+from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
 from gyrostab.read.options import FileSummary, ReadOptions
@@ -59,8 +60,10 @@ def _reader(path: Path) -> Reader:
         reader = cast(Reader, _registered()[name].load())
         if reader.matches(path):
             return reader
-    kind = "directory" if path.is_dir() else f"file with the suffix {path.suffix!r}"
-    raise FormatError(f"{path}: no reader takes this {kind}; formats are {', '.join(readers())}")
+    if path.is_dir():
+        raise FormatError(f"{path}: no reader takes this directory; name the files in it, for instance {path / '*.csv'}")
+    what = f"no reader takes this file with the suffix {path.suffix!r}, and it is not text"
+    raise FormatError(f"{path}: {what}; formats are {', '.join(readers())}: save it as one of these")
 
 
 def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
@@ -116,7 +119,30 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
     (('x',), 2, np.datetime64('1970-01-01T00:00:00.500000000'))
     """
     path = Path(path)
-    return _reader(path).scan(path, options or ReadOptions())
+    reader = _reader(path)
+    with _damage_named(path):
+        return reader.scan(path, options or ReadOptions())
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Make a `FormatError` of what the format libraries say when they come upon damaged bytes in the midst of a file."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, GyrostabError) or error.errno is not None:
+            raise
+        raise FormatError(f"{path.name}: is damaged ({error}); copy it again") from error
+    except RuntimeError as error:
+        if not str(error).startswith("NetCDF:"):
+            raise
+        raise FormatError(f"{path.name}: is damaged ({error}); copy it again") from error
+
+
+def _read(path: Path, options: ReadOptions) -> xr.Dataset:
+    reader = _reader(path)
+    with _damage_named(path):
+        return reader.read(path, options)
 
 
 def read_log(
@@ -183,7 +209,7 @@ def read_log(
     logs = [path.name for path, part in zip(found, parts, strict=True) if "sampling_rate_hz" in part.attrs]
     if logs and len(parts) > 1:
         raise OptionError(f"{logs[0]} is a regular log already; join the source files instead, or process the logs one by one")
-    channels = [_reader(path).read(path, replace(options, channels_only=True, start=None)) for path in extra]
+    channels = [_read(path, replace(options, channels_only=True, start=None)) for path in extra]
     if not logs:
         _check_options([*parts, *channels])
         parts = [concatenate(parts)]
@@ -195,7 +221,7 @@ def _read_all(paths: Sequence[Path], options: ReadOptions) -> list[xr.Dataset]:
     parts: list[xr.Dataset] = []
     held = 0
     for path in paths:
-        part = _reader(path).read(path, options)
+        part = _read(path, options)
         held += memory(part)
         if held > SPILL_BYTES and len(paths) > 1:
             held -= memory(part)
@@ -207,6 +233,7 @@ def _read_all(paths: Sequence[Path], options: ReadOptions) -> list[xr.Dataset]:
 def _check_options(parts: Sequence[xr.Dataset]) -> None:
     """Refuse a ``--map`` or ``--unit`` that no file has a use for: it is a slip of the pen."""
     unmatched = set.intersection(*(set(part.attrs.pop("unmatched_options", ())) for part in parts))
+    headers = dict.fromkeys(name for part in parts for name in part.attrs.pop("headers", ()))
     if unmatched:
         files = ", ".join(dict.fromkeys(name for part in parts for name in part.attrs["source_files"]))
-        raise OptionError(f"{' and '.join(sorted(unmatched))}: no such column in {files}; gyrostab scan lists the columns")
+        raise OptionError(f"{' and '.join(sorted(unmatched))}: no such column in {files}; the columns are {', '.join(headers)}")

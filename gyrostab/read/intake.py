@@ -146,6 +146,7 @@ class Intake:
             unreadable_rows=self.bad_rows,
             unreadable_cells=self.bad_cells,
             unmatched_options=list(self.plan.unmatched),
+            headers=[summary.header for summary in self.plan.summaries],
         )
         return dataset
 

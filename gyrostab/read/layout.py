@@ -10,7 +10,7 @@ from pathlib import Path
 from gyrostab.errors import FormatError
 from gyrostab.read.stamps import looks_iso
 
-__all__ = ["BLANK", "Layout", "find_layout", "is_number", "split_line"]
+__all__ = ["BLANK", "Layout", "find_layout", "is_number", "is_text", "split_line"]
 
 #: Stands for any run of blanks as the separator.
 BLANK = " "
@@ -46,6 +46,12 @@ def is_number(text: str, *, comma: bool = False) -> bool:
     """Whether a cell holds a plain decimal number (no words, no ``nan``)."""
     text = text.strip()
     return bool(_NUMBER.match(text.replace(",", ".") if comma else text))
+
+
+def is_text(head: bytes) -> bool:
+    """Whether the beginning of a file looks like text: no zero byte and hardly any control codes."""
+    control = sum(head.count(code) for code in (*range(0, 9), *range(14, 32)))
+    return b"\0" not in head and control <= 0.02 * len(head)
 
 
 def split_line(line: str, separator: str) -> list[str]:
@@ -99,11 +105,10 @@ def find_layout(path: Path, head: bytes, *, complete: bool) -> Layout:
 
 def _decode(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list[str]]:
     if not head.strip():
-        raise FormatError(f"{path.name}: the file is empty")
+        raise FormatError(f"{path.name}: the file is empty; copy it again")
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise FormatError(f"{path.name}: the file is UTF-16 text; save it as UTF-8 (iconv -f utf-16 -t utf-8)")
-    control = sum(head[:4096].count(code) for code in (*range(0, 9), *range(14, 32)))
-    if b"\0" in head or control > 0.02 * min(len(head), 4096):
+    if not is_text(head[:4096]):  # further down, junk such as a block of zeros after a loss of power spoils single rows only
         raise FormatError(f"{path.name}: this is not text but binary data; if it is a known format, give the file its right suffix")
     notes = []
     lines = head.splitlines()

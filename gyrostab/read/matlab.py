@@ -1,4 +1,4 @@
-"""MATLAB files, version 5 and 7.3: vectors by name, columns of a matrix by ``name/3`` (counted from 0).
+"""MATLAB files, version 5 and 7.3, and plain HDF5 files: vectors by name, columns of a matrix by ``name/3`` (counted from 0).
 
 The rows of a matrix run along its longer side. Fields of a structure are called ``name.field``.
 """
@@ -22,6 +22,7 @@ from gyrostab.read.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
+HDF_SUFFIXES = (".h5", ".hdf5")
 #: A matrix with more columns than this is no table of sensors.
 MAX_COLUMNS = 64
 
@@ -47,15 +48,16 @@ class _Vector:
 
 
 def matches(path: Path) -> bool:
-    """Whether the file is called ``.mat``."""
-    return path.is_file() and path.suffix.lower() == ".mat"
+    """Whether the file is called ``.mat``, or ``.h5`` or ``.hdf5``, which is what MATLAB 7.3 writes within."""
+    return path.is_file() and path.suffix.lower() in (".mat", *HDF_SUFFIXES)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Variables and their shapes, the stamps of the two ends."""
     with ExitStack() as stack:
         vectors, plan, notes = _look(path, options, stack)
-        return summarise(path, "matlab", plan, options, vectors[0].rows, lambda source, a, b: vectors[source].part(a, b), notes)
+        name = "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab"
+        return summarise(path, name, plan, options, vectors[0].rows, lambda source, a, b: vectors[source].part(a, b), notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
@@ -76,7 +78,14 @@ def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vec
     kept = [vector for vector in found if vector.rows == rows]
     others = [vector.header for vector in found if vector.rows != rows]
     notes = [f"left out, as they are shorter than the {rows} rows of the longest: {', '.join(others[:20])}"] if others else []
-    return kept, plan_columns(path, [vector.header for vector in kept], options), notes
+    units = {place: text for place, vector in enumerate(kept) if (text := _units(vector.array))}
+    return kept, plan_columns(path, [vector.header for vector in kept], options, units=units), notes
+
+
+def _units(array: Any) -> str | None:
+    """The attribute ``units`` of an HDF5 dataset."""
+    text = getattr(array, "attrs", {}).get("units")
+    return text.decode() if isinstance(text, bytes) else text if isinstance(text, str) else None
 
 
 def _vectors(name: str, array: Any) -> Iterator[_Vector]:
@@ -92,7 +101,7 @@ def _vectors(name: str, array: Any) -> Iterator[_Vector]:
 def _arrays(path: Path, stack: ExitStack) -> Iterator[tuple[str, Any]]:
     with path.open("rb") as file:
         head = file.read(1024)
-    if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head:
+    if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
         yield from _arrays_hdf(path, stack)
         return
     from scipy.io import loadmat
@@ -120,7 +129,8 @@ def _arrays_hdf(path: Path, stack: ExitStack) -> Iterator[tuple[str, Any]]:
     try:
         file = stack.enter_context(h5py.File(path, "r"))
     except OSError as error:
-        raise FormatError(f"{path.name}: this MATLAB 7.3 file cannot be opened ({error}); it may be cut off, copy it again") from error
+        what = f"this HDF5 file (MATLAB 7.3 is one) cannot be opened ({error})"
+        raise FormatError(f"{path.name}: {what}; it may be cut off, copy it again") from error
     found: list[tuple[str, Any]] = []
 
     def visit(name: str, item: Any) -> None:

@@ -24,7 +24,7 @@ from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.cells import Typing, parse_cells, parse_fast, stamp_types
 from gyrostab.read.columns import Column, Plan, plan_columns
 from gyrostab.read.intake import Intake, summary_notes, summary_stamp
-from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, split_line
+from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.stamps import NAT, cells_to_ns, looks_iso
 
@@ -34,13 +34,14 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 HEAD_BYTES = 2**18
 BLOCK_BYTES = 2**24
 PIECE_BYTES = 2**18
+PART_BYTES = 2**16
 COUNTED_BYTES = 2**24
 
 
 def matches(path: Path) -> bool:
-    """Whether the file has the name of a text log (gzipped or not)."""
+    """Whether the file has the name of a text log (gzipped or not), or holds text with figures in it whatever its name is."""
     name = path.name.lower().removesuffix(".gz")
-    return path.is_file() and name.endswith(SUFFIXES)
+    return path.is_file() and (name.endswith(SUFFIXES) or _holds_text(path))
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
@@ -114,6 +115,15 @@ def _gzipped(path: Path) -> bool:
         return file.read(2) == b"\x1f\x8b"
 
 
+def _holds_text(path: Path) -> bool:
+    try:
+        with _open(path) as file:
+            head = file.read(4096)
+    except (EOFError, zlib.error, OSError):
+        return False
+    return is_text(head) and any(48 <= code < 58 for code in head)
+
+
 def _open(path: Path) -> IO[bytes]:
     return cast(IO[bytes], gzip.open(path, "rb")) if _gzipped(path) else path.open("rb")
 
@@ -123,7 +133,7 @@ def _chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
     parts: list[bytes] = []
     missing = size
     try:
-        while missing > 0 and (part := file.read(missing)):
+        while missing > 0 and (part := file.read(min(missing, PART_BYTES))):
             parts.append(part)
             missing -= len(part)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:

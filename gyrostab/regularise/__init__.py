@@ -16,7 +16,7 @@ import xarray as xr
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.regularise.fill import gathered, on_grid
 from gyrostab.regularise.gaps import find_gaps, gap_table, gap_variables
-from gyrostab.regularise.notes import describe, describe_rate
+from gyrostab.regularise.notes import describe, describe_channels, describe_rate
 from gyrostab.regularise.place import Placement, place_by_count, place_by_stamp, place_without_time
 from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_rate, odd_stretches
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
@@ -212,4 +212,5 @@ def regularise(
         xr.Coordinates({"axis": raw["axis"].variable, **own}).merge(time_coordinate(placement.start, hertz, placement.size)).coords
     )
     done = f"{placement.placed} of {found.rows} rows on {placement.size} samples at {hertz:.10g} Hz"
-    return xr.Dataset(variables, coordinates, _attributes(raw, signal, hertz, done, notes))
+    log = xr.Dataset(variables, coordinates, _attributes(raw, signal, hertz, done, notes))
+    return log.assign_attrs(notes=[*log.attrs["notes"], *describe_channels(log)])

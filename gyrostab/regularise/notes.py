@@ -11,10 +11,10 @@ from gyrostab.regularise.fill import samples_of
 from gyrostab.regularise.place import Placement
 from gyrostab.regularise.rate import RateEstimate
 from gyrostab.regularise.survey import Survey, file_of, stamp_text
-from gyrostab.schema import GAP_CAUSES
+from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.timegrid import grid_times
 
-__all__ = ["describe", "describe_rate", "duration"]
+__all__ = ["describe", "describe_channels", "describe_rate", "duration"]
 
 _NAMED = 5  # of many events of one kind, so many are told one by one
 
@@ -30,6 +30,25 @@ def duration(seconds: float) -> str:
     if abs(seconds) < 1.0:
         return f"{seconds * 1e3:.3g} ms"
     return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def describe_channels(log: xr.Dataset) -> list[str]:
+    """Sentences on channels with a time of their own that have no value while the gyro was recorded."""
+    notes = []
+    start, end = log["time"][[0, -1]].values  # the time of a long gap is not held in memory
+    for name in log_channels(log):
+        if f"time_{name}" not in log.coords:
+            continue
+        stamps = log[f"time_{name}"].values
+        if not ((stamps >= start) & (stamps <= end)).any():
+            of = f"{_count(len(stamps), 'value')}, {_span(stamps.min(), stamps.max())}" if len(stamps) else "0 values"
+            advice = "check its time column, its unit and --epoch"
+            notes.append(f"channel {name}: none of its {of}, lies within the log, {_span(start, end)}; {advice}")
+    return notes
+
+
+def _span(first: np.datetime64, last: np.datetime64) -> str:
+    return " to ".join(stamp_text(int(stamp.astype("datetime64[ns]").view(np.int64))) for stamp in (first, last))
 
 
 def _count(number: int, what: str) -> str:
