@@ -144,14 +144,29 @@ def _columns(columns, white, quantization, index, n):  # type: ignore[no-untyped
 
 
 @njit(nogil=True, cache=True)
-def _covariance(squares, to_samples, white, quantization, factor, pairs, ramps, index, n, out):  # type: ignore[no-untyped-def]
+def _amounts(squares, to_samples, columns, white, quantization, out):  # type: ignore[no-untyped-def]
+    """Squared coefficients of the stochastic terms in sample units, as one cell sees them through the gaps.
+
+    What the gaps add to quantization noise comes from the ends of many runs spread over each cluster, so it scatters
+    like white noise and is counted there.
+    """
+    excess = max(quantization - 1.0, 0.0) * columns[0] / columns[1]
+    out[0] = squares[0] * min(quantization, 1.0) * to_samples[0]
+    out[1] = (squares[1] * white + squares[0] * excess) * to_samples[1]
+    out[2] = squares[2] * to_samples[2]
+    out[3] = squares[3] * to_samples[3]
+
+
+@njit(nogil=True, cache=True)
+def _covariance(squares, to_samples, columns, white, quantization, factor, pairs, ramps, index, n, out):  # type: ignore[no-untyped-def]
     """Covariance of the valid cells for squared coefficients `squares`; `out` (n, n) is overwritten."""
     root = np.empty((4, n))
+    amounts = np.empty(4)
     for i in range(n):
         cell = index[i]
+        _amounts(squares, to_samples, columns[cell], white[cell], quantization[cell], amounts)
         for a in range(4):
-            response = quantization[cell] if a == 0 else (white[cell] if a == 1 else 1.0)
-            root[a, i] = np.sqrt(max(squares[a], 0.0) * to_samples[a] * response)
+            root[a, i] = np.sqrt(max(amounts[a], 0.0))
     ramp = max(squares[4], 0.0) * to_samples[4]
     for i in range(n):
         for j in range(i + 1):
@@ -213,19 +228,18 @@ def degrees_of_freedom(squares, to_samples, columns, white, quantization, factor
     """
     n_tau = columns.shape[0]
     out = np.zeros(n_tau)
+    amounts = np.empty(4)
     for i in range(n_tau):
         mean = 0.0
-        variance = 0.0
         for a in range(5):
             response = quantization[i] if a == 0 else (white[i] if a == 1 else 1.0)
-            share = squares[a] * response
-            mean += share * columns[i, a]
-            if a == 4:
-                continue
-            variance += share * to_samples[a] * squares[4] * to_samples[4] * ramps[a, i]
+            mean += squares[a] * response * columns[i, a]
+        variance = 0.0
+        _amounts(squares, to_samples, columns[i], white[i], quantization[i], amounts)
+        for a in range(4):
+            variance += amounts[a] * squares[4] * to_samples[4] * ramps[a, i]
             for b in range(4):
-                other = quantization[i] if b == 0 else (white[i] if b == 1 else 1.0)
-                variance += share * to_samples[a] * squares[b] * other * to_samples[b] * pairs[a, b, i]
+                variance += amounts[a] * amounts[b] * pairs[a, b, i]
         if variance > 0.0:
             out[i] = 2.0 * mean * mean / variance * factor[i]
     return out
@@ -348,28 +362,28 @@ def _without(a, squares, design, trial):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _spread(a, squares, design, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread):  # type: ignore[no-untyped-def]
+def _spread(a, squares, design, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread):  # type: ignore[no-untyped-def]
     """Covariance of the cells as a polynomial in the squared coefficient of term `a`: constant, linear and square parts."""
     trial = np.empty(squares.size)
     _without(a, squares, design, trial)
-    _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[0])
+    _covariance(trial, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread[0])
     trial[a] = 1.0
-    _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[1])
+    _covariance(trial, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread[1])
     trial[:] = 0.0
     trial[a] = 1.0
-    _covariance(trial, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread[2])
+    _covariance(trial, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread[2])
     for i in range(n):
         for j in range(n):
             spread[1, i, j] -= spread[0, i, j] + spread[2, i, j]
 
 
 @njit(nogil=True, cache=True)
-def _factorise(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, data, factor):  # type: ignore[no-untyped-def]
+def _factorise(squares, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, data, factor):  # type: ignore[no-untyped-def]
     """Cholesky factor of the covariance of the valid cells; False when it is hopeless."""
     n = data.size
     jitter = 1e-7  # the sums over lags are good to about this; a strong ramp may need more
     while jitter < 1.0:
-        _covariance(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, factor)
+        _covariance(squares, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, factor)
         for i in range(n):  # the second part keeps a window without any noise solvable
             factor[i, i] += jitter * factor[i, i] + 1e-16 * data[i] * data[i]
         if _cholesky(factor, n):
@@ -398,7 +412,7 @@ def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, r
     rest = data
     for _ in range(6):
         previous = squares.copy()
-        if not _factorise(squares, to_samples, white, quantization, gap_factor, pairs, ramps, index, data, factor):
+        if not _factorise(squares, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, data, factor):
             return np.nan, 0, n
         normal, right, whitened, rest = _normal_equations(data, design, factor, n)
         chosen = solve_nonnegative(normal, right, allowed, squares)
@@ -412,7 +426,7 @@ def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, r
     for a in range(terms):
         if allowed >> a & 1:
             used += chosen >> a & 1
-            _spread(a, squares, design, to_samples, white, quantization, gap_factor, pairs, ramps, index, n, spread)
+            _spread(a, squares, design, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread)
             _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, result)
     chi2 = 0.0
     for i in range(n):
