@@ -87,6 +87,7 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
     """
     from gyrostab.read import read_log
     from gyrostab.regularise import regularise
+    from gyrostab.regularise.notes import describe_channels
 
     log = read_log(paths, **reading)
     if "sampling_rate_hz" not in log.attrs:
@@ -94,6 +95,8 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
         said = "; ".join(f"{name}: {_said(value)}" for name, value in reading.items() if value)
         if said:
             log.attrs["history"] += f" (read with {said})"
+    elif reading.get("channel"):
+        log = log.assign_attrs(notes=[*log.attrs.get("notes", []), *describe_channels(log)])
     for note in log.attrs.get("notes", []):
         warnings.warn(note, stacklevel=2)
     return log

@@ -94,7 +94,7 @@ def _folder(path: Path) -> Path:
 
 
 def _damaged_log(folder: Path) -> list[object]:
-    to_netcdf(load_log([write_log(folder / "good.csv")]), folder / "bad.nc")
+    to_netcdf(load_log([write_log(folder / "good.csv")], epoch="2026-03-01"), folder / "bad.nc")
     whole = bytearray((folder / "bad.nc").read_bytes())
     whole[len(whole) // 2 : len(whole) // 2 + 200] = b"\xff" * 200
     (folder / "bad.nc").write_bytes(bytes(whole))
@@ -208,6 +208,19 @@ def test_the_reading_options_stand_in_the_history(log, tmp_path):
     assert call("ingest", log, "-o", tmp_path / "log.nc", "--epoch", "2026-03-01", "--map", "gyro_y=-") == 0
     with open_log(tmp_path / "log.nc") as stored:
         assert "(read with epoch: 2026-03-01; map: gyro_y=-)" in stored.attrs["history"]
+
+
+def test_options_that_do_not_fit_a_regular_log(log, tmp_path, capfd):
+    regular = tmp_path / "log.nc"
+    far = tmp_path / "far.csv"
+    far.write_text("time,temperature [degC]\n2026-01-01T00:00:00,20\n2026-01-01T00:00:10,21\n")
+    assert call("ingest", log, "-o", regular) == 0
+    assert call("run", regular, "-o", tmp_path / "a.nc", *WINDOW, "--rate", RATE / 2) == 2
+    assert "regular log of 100 Hz, not of 50 Hz" in capfd.readouterr().err
+    assert call("run", regular, "-o", tmp_path / "a.nc", *WINDOW, "--rate", RATE, "--unit", "gyro=deg/s") == 0
+    assert "--unit is not used" in capfd.readouterr().err
+    assert call("run", regular, "-o", tmp_path / "b.nc", *WINDOW, "--channel", far) == 0
+    assert "none of its 2 values" in capfd.readouterr().err
 
 
 def test_constant_signal_runs_with_a_note(tmp_path, capfd):

@@ -213,6 +213,8 @@ def read_log(
     if not logs:
         _check_options([*parts, *channels])
         parts = [concatenate(parts)]
+    else:
+        parts = [_check_regular(parts[0], logs[0], options)]
     return attach_channels(parts[0], channels)
 
 
@@ -228,6 +230,21 @@ def _read_all(paths: Sequence[Path], options: ReadOptions) -> list[xr.Dataset]:
             part = to_disk(part)
         parts.append(part)
     return parts
+
+
+def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Dataset:
+    """A regular log has its rate, names and units; what the user says against that is refused, what is idle is noted."""
+    rate = float(log.attrs["sampling_rate_hz"])
+    if options.rate is not None and abs(options.rate / rate - 1) > 1e-6:
+        raise OptionError(
+            f"{name} is a regular log of {rate:.10g} Hz, not of {options.rate:.10g} Hz; leave out --rate, or ingest its source anew"
+        )
+    idle = [f"--{option}" for option in ("start", "epoch", "map", "unit", "kind") if getattr(options, option)]
+    if not idle or options.channel:
+        return log
+    before = log.attrs.get("notes", [])
+    note = f"{name}: is a regular log already, so {', '.join(idle)} is not used"
+    return log.assign_attrs(notes=[*([before] if isinstance(before, str) else before), note])
 
 
 def _check_options(parts: Sequence[xr.Dataset]) -> None:
