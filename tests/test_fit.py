@@ -12,7 +12,7 @@ from gyrostab.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.fit import fit_noise
 from gyrostab.kernels.covariance import pair_products
-from gyrostab.kernels.least_squares import solve_nonnegative
+from gyrostab.kernels.nonnegative import solve_nonnegative
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.log import make_log
 from gyrostab.noise import LAWS, TERMS, model_avar

@@ -2,8 +2,7 @@
 
 The Allan variance is linear in the squared coefficients, so a window is ``y = X s + e`` with ``s >= 0``. Overlapping
 estimates at neighbouring averaging factors share data; the covariance of e follows from the noise itself
-(`gyrostab.kernels.covariance`), so it is taken from the fit and iterated. The non-negative solution is exact: the at
-most 31 subsets of five terms are tried.
+(`gyrostab.kernels.covariance`), so it is taken from the fit and iterated.
 """
 
 from __future__ import annotations
@@ -11,116 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["FIT_FIELDS", "degrees_of_freedom", "fit_window", "fit_windows", "identify_noise", "solve_nonnegative"]
+from gyrostab.kernels.nonnegative import cholesky, solve_lower, solve_nonnegative, solve_subset, solve_upper
+
+__all__ = ["FIT_FIELDS", "degrees_of_freedom", "fit_window", "fit_windows", "identify_noise"]
 
 #: Rows of the per-term result of `fit_windows`.
 FIT_FIELDS = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square", "separation")
-
-
-@njit(nogil=True, cache=True)
-def _cholesky(matrix, n):  # type: ignore[no-untyped-def]
-    """Lower factor in place of the leading n x n block; False when it is not positive definite."""
-    for j in range(n):
-        for i in range(j, n):
-            total = matrix[i, j]
-            for p in range(j):
-                total -= matrix[i, p] * matrix[j, p]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                matrix[j, j] = np.sqrt(total)
-            else:
-                matrix[i, j] = total / matrix[j, j]
-    return True
-
-
-@njit(nogil=True, cache=True)
-def _forward(factor, n, vector):  # type: ignore[no-untyped-def]
-    """Solve ``factor x = vector`` in place."""
-    for i in range(n):
-        total = vector[i]
-        for p in range(i):
-            total -= factor[i, p] * vector[p]
-        vector[i] = total / factor[i, i]
-
-
-@njit(nogil=True, cache=True)
-def _backward(factor, n, vector):  # type: ignore[no-untyped-def]
-    """Solve ``factor^T x = vector`` in place."""
-    for i in range(n - 1, -1, -1):
-        total = vector[i]
-        for p in range(i + 1, n):
-            total -= factor[p, i] * vector[p]
-        vector[i] = total / factor[i, i]
-
-
-@njit(nogil=True, cache=True)
-def _solve_subset(normal, right, subset, solution):  # type: ignore[no-untyped-def]
-    """Solve the normal equations for the terms in the bit set `subset`; False when they cannot be told apart."""
-    members = np.empty(right.size, np.int64)
-    n = 0
-    for a in range(right.size):
-        if subset >> a & 1:
-            members[n] = a
-            n += 1
-    factor = np.empty((n, n))
-    vector = np.empty(n)
-    for i in range(n):
-        vector[i] = right[members[i]]
-        for j in range(n):
-            factor[i, j] = normal[members[i], members[j]]
-        factor[i, i] *= 1.0 + 1e-12
-    if not _cholesky(factor, n):
-        return False
-    _forward(factor, n, vector)
-    _backward(factor, n, vector)
-    solution[:] = 0.0
-    for i in range(n):
-        solution[members[i]] = vector[i]
-    return True
-
-
-@njit(nogil=True, cache=True)
-def solve_nonnegative(normal, right, allowed, solution):  # type: ignore[no-untyped-def]
-    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``; returns the bit set of the terms above zero.
-
-    Parameters
-    ----------
-    normal : float64 (n, n); right : float64 (n,)
-        Normal equations.
-    allowed : int
-        Bit set of the terms that may be used.
-    solution : float64 (n,)
-        Overwritten with the minimiser.
-    """
-    n = right.size
-    scale = np.empty(n)
-    scaled = np.empty((n, n))
-    scaled_right = np.empty(n)
-    for i in range(n):
-        scale[i] = 1.0 / np.sqrt(normal[i, i]) if normal[i, i] > 0.0 else 0.0
-    for i in range(n):
-        scaled_right[i] = right[i] * scale[i]
-        for j in range(n):
-            scaled[i, j] = normal[i, j] * scale[i] * scale[j]
-    best = 0.0
-    chosen = 0
-    trial = np.empty(n)
-    solution[:] = 0.0
-    for subset in range(1, 1 << n):
-        if subset & ~allowed or not _solve_subset(scaled, scaled_right, subset, trial):
-            continue
-        gain = 0.0
-        feasible = True
-        for i in range(n):
-            feasible = feasible and trial[i] >= 0.0
-            gain += trial[i] * scaled_right[i]
-        if feasible and gain > best:
-            best = gain
-            chosen = subset
-            for i in range(n):
-                solution[i] = trial[i] * scale[i]
-    return chosen
 
 
 @njit(nogil=True, cache=True)
@@ -283,11 +178,11 @@ def _normal_equations(y, design, factor, n):  # type: ignore[no-untyped-def]
     terms = design.shape[1]
     whitened = np.empty((terms, n))
     data = y.copy()
-    _forward(factor, n, data)
+    solve_lower(factor, n, data)
     for a in range(terms):
         for i in range(n):
             whitened[a, i] = design[i, a]
-        _forward(factor, n, whitened[a])
+        solve_lower(factor, n, whitened[a])
     normal = np.empty((terms, terms))
     right = np.empty(terms)
     for a in range(terms):
@@ -317,7 +212,7 @@ def _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, 
         for c in range(terms):
             scaled[b, c] = normal[b, c] * scale[b] * scale[c]
     row = np.empty(terms)
-    if not _solve_subset(scaled, unit, subset, row):
+    if not solve_subset(scaled, unit, subset, row):
         result[6, a] = 0.0
         return
     result[0, a] = squares[a]
@@ -329,14 +224,14 @@ def _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, 
         for i in range(n):
             weights[i] += row[b] * whitened[b, i]
     result[1, a] = np.sqrt(max(row[a], 0.0))
-    _backward(factor, n, weights)  # estimator as weights on the cells
+    solve_upper(factor, n, weights)  # estimator as weights on the cells
     for p in range(3):  # spread[0]: covariance without the term; [1]: growth with it; [2]: its own square
         total = 0.0
         for i in range(n):
             for j in range(n):
                 total += weights[i] * weights[j] * spread[p, i, j]
         result[3 + p, a] = total
-    if _solve_subset(scaled, unit, allowed, row):
+    if solve_subset(scaled, unit, allowed, row):
         result[6, a] = 1.0 / max(row[a] * scale[a] * normal[a, a], 1.0)
     else:
         result[6, a] = 0.0
@@ -386,7 +281,7 @@ def _factorise(squares, to_samples, columns, white, quantization, gap_factor, pa
         _covariance(squares, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, factor)
         for i in range(n):  # the second part keeps a window without any noise solvable
             factor[i, i] += jitter * factor[i, i] + 1e-16 * data[i] * data[i]
-        if _cholesky(factor, n):
+        if cholesky(factor, n):
             return True
         jitter *= 10.0
     return False
