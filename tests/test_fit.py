@@ -55,6 +55,19 @@ def test_95_percent_intervals_hold_the_truth(kind, share, block):
         assert float(hit.max()) <= 0.98
 
 
+def test_intervals_hold_where_tiny_gaps_raise_quantization_noise():
+    rng = np.random.default_rng(18)
+    x = white(rng, 1500, 2000, N=0.01, rate=RATE) + quantization(rng, 1500, 2000, Q=0.4, rate=RATE)
+    product = fit_noise(windows_of(lose(rng, x, 0.2, 5), taus=16))
+    assert float(product.quantization_response.max()) > 30
+    truth = product.white_response * model_avar(product.tau, {"N": 0.01})
+    truth = truth + product.quantization_response * model_avar(product.tau, {"Q": 0.4})
+    limits = confidence_interval(product)
+    hit = ((limits.avar_lower <= truth) & (truth <= limits.avar_upper)).mean(("axis", "time"))
+    assert float(hit.min()) > 0.925
+    assert float(hit.max()) < 0.99
+
+
 def test_degrees_of_freedom_are_those_of_greenhall():
     """allantools computes the same published tables by a different route; its white-noise case is approximate at short tau."""
     from allantools.ci import edf_greenhall
