@@ -9,133 +9,20 @@ import errno
 import signal
 import sys
 import threading
-import tomllib
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TextIO
+from typing import Annotated, Any, TextIO
 
-from cyclopts import App, CycloptsError, Group, Parameter
-from cyclopts.validators import Number
+from cyclopts import App, CycloptsError, Parameter
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
+from gyrostab.options import Common, Fitting, Reading, Windows, read_toml
 
 __all__ = ["app", "main"]
 
-_READING = Group("Reading options", sort_key=1)
-_WINDOWS = Group("Analysis options", sort_key=2)
-_COMMON = Group("Common options", sort_key=3)
-Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
-
-
-@Parameter(name="*", group=_READING)
-@dataclass(frozen=True)
-class Reading:
-    """How a log is to be read where it does not say so itself.
-
-    Parameters
-    ----------
-    rate
-        Sampling rate in Hz, for a log without a time column (otherwise the rate is found from the time stamps and checked against this).
-    start
-        Time of the first row, for a log without a time column: 2026-11-20T14:00:00.
-    epoch
-        Day from which a time column in seconds counts: 2026-11-20 (default 1970-01-01).
-    map
-        Rename a column: wx=gyro_x. Repeat for more columns, or give a TOML file with one line per column: wx = "gyro_x".
-    unit
-        Unit of a column that has none: gyro=deg/s, gyro_x=deg/s, temperature=degC; of counts: "gyro=0.1 arcsec/s". Repeat for more.
-    kind
-        Whether the gyro columns are rotation rates or angles.
-    channel
-        Another file with a channel (temperature, vibration ...) of the same time. Repeat for more.
-    """
-
-    rate: Annotated[float | None, Parameter(metavar="HZ")] = None
-    start: Annotated[str | None, Parameter(metavar="TIME")] = None
-    epoch: Annotated[str | None, Parameter(metavar="TIME")] = None
-    map: Annotated[list[str] | None, Parameter(metavar="HEADER=NAME", negative=())] = None
-    unit: Annotated[list[str] | None, Parameter(metavar="NAME=UNIT", negative=())] = None
-    kind: Literal["rate", "angle"] | None = None
-    channel: Annotated[list[Path] | None, Parameter(metavar="FILE", negative=())] = None
-
-    def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.read.read_log`."""
-        chosen = {
-            **asdict(self),
-            "map": _pairs(self.map, "--map"),
-            "unit": _pairs(self.unit, "--unit"),
-            "channel": tuple(self.channel or ()),
-        }
-        return {name: value for name, value in chosen.items() if value not in (None, (), {})}
-
-
-@Parameter(name="*", group=_WINDOWS)
-@dataclass(frozen=True)
-class Windows:
-    """The sliding window of the dynamic Allan variance.
-
-    Parameters
-    ----------
-    window
-        Length of the sliding window: 10min, 500ms, 2h or 2000samples.
-    step
-        Distance from one window to the next, in the same manner (default: a tenth of the window).
-    taus
-        Averaging times: how many (40, spread evenly on a logarithmic scale), octave (1, 2, 4 ... samples), all, or a list: 0.1s,1s,10s.
-    tau_max
-        Longest averaging time (default: a third of the window; at most half of it).
-    overlap
-        full uses every second difference; octave thins them out where tau is long: faster on long windows, 1 % more scatter.
-    gaps
-        bridge counts only what is there; zero divides by the gap-free number, as some papers do, which digs a canyon at every gap.
-    axis
-        Only this gyro axis: x. Repeat for more.
-    """
-
-    window: Annotated[str, Parameter(metavar="DURATION")] = "10min"
-    step: Annotated[str | None, Parameter(metavar="DURATION")] = None
-    taus: Annotated[str, Parameter(metavar="LIST")] = "40"
-    tau_max: Annotated[str | None, Parameter(metavar="DURATION")] = None
-    overlap: Literal["full", "octave"] = "full"
-    gaps: Literal["bridge", "zero"] = "bridge"
-    axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None
-
-    def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.davar.davar`."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
-
-
-@Parameter(name="*", group=_COMMON)
-@dataclass(frozen=True)
-class Common:
-    """What every command takes.
-
-    Parameters
-    ----------
-    config
-        TOML file with defaults for the options: [run] window = "10min".
-    workers
-        Processor cores to use (default: all).
-    overwrite
-        Replace an output that exists.
-    quiet_progress
-        Show no progress.
-    debug
-        Show where in the program an error arose.
-    """
-
-    config: Annotated[Path | None, Parameter(metavar="FILE.toml")] = None
-    workers: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=1))] = None
-    overwrite: Flag = False
-    quiet_progress: Flag = False
-    debug: Flag = False
-
-
 Logs = Annotated[list[Path], Parameter(name="LOG...", negative=())]
-Log = Annotated[Path, Parameter(name="LOG")]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], metavar="FILE")]
 
 app = App(
@@ -146,32 +33,6 @@ app = App(
     help_format="plaintext",
     suppress_keyboard_interrupt=False,
 )
-
-
-def _pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
-    """``["wx=gyro_x"]`` as a dict; an item may also name a TOML file of such pairs."""
-    found: dict[str, str] = {}
-    for item in items or ():
-        name, equals, value = item.partition("=")
-        if equals and name.strip() and value.strip():
-            found[name.strip()] = value.strip()
-        elif item.endswith(".toml"):
-            found.update({key: str(value) for key, value in _read_toml(Path(item)).items()})
-        else:
-            raise OptionError(f"{option} {item!r}: write NAME=VALUE, for instance {option} {_PAIR_EXAMPLES[option]}")
-    return found
-
-
-_PAIR_EXAMPLES = {"--map": "wx=gyro_x", "--unit": "gyro=deg/s"}
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path}: not a TOML file ({error})") from error
 
 
 @contextmanager
@@ -230,7 +91,7 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
 
 
 @app.command(sort_key=2, help_epilogue="")
-def ingest(logs: Logs, /, *, output: Output, max_gap: str = "10D", reading: Reading = Reading(), common: Common = Common()) -> None:
+def ingest(logs: Logs, /, *, output: Output, reading: Reading = Reading(), common: Common = Common()) -> None:
     """Put logs on one uniform time axis, with the gaps marked, and write them as NetCDF or Zarr.
 
     Example: gyrostab ingest run7/*.csv -o run7.nc
@@ -241,8 +102,6 @@ def ingest(logs: Logs, /, *, output: Output, max_gap: str = "10D", reading: Read
         One or more logs, in any order.
     output
         File to write, LOG.nc or LOG.zarr.
-    max_gap
-        Longest gap; a longer step of the time stamps is taken for a step of the clock.
     """
     from gyrostab.export import to_netcdf, to_zarr
     from gyrostab.run import check_output, load_log, samples_of
@@ -250,7 +109,7 @@ def ingest(logs: Logs, /, *, output: Output, max_gap: str = "10D", reading: Read
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite, inputs=logs)
     with _work(common) as stage:
         stage("reading", 0)
-        log = load_log(logs, max_gap=max_gap, **reading.options())
+        log = load_log(logs, **reading.options())
         stage("writing", samples_of(log))
         write = to_zarr if target.suffix == ".zarr" else to_netcdf
         write(log, target, overwrite=common.overwrite)
@@ -264,6 +123,7 @@ def run(
     *,
     output: Output,
     windows: Windows = Windows(),
+    fitting: Fitting = Fitting(),
     reading: Reading = Reading(),
     common: Common = Common(),
 ) -> None:
@@ -283,30 +143,39 @@ def run(
     from gyrostab.run import run as run_job
 
     with _work(common) as stage:
-        target = run_job(logs, output, reading=reading.options(), windows=windows.options(), overwrite=common.overwrite, stage=stage)
+        target = run_job(
+            logs,
+            output,
+            reading=reading.options(),
+            windows=windows.options(),
+            fitting=fitting.options(),
+            overwrite=common.overwrite,
+            stage=stage,
+        )
     print(target)
 
 
 @app.command(sort_key=4, help_epilogue="")
-def davar(log: Log, /, *, output: Output, windows: Windows = Windows(), common: Common = Common()) -> None:
+def davar(logs: Logs, /, *, output: Output, windows: Windows = Windows(), reading: Reading = Reading(), common: Common = Common()) -> None:
     """Compute the dynamic Allan variance of a log.
 
     Example: gyrostab davar run7.nc -o davar.nc --window 10min --step 1min
 
     Parameters
     ----------
-    log
-        Log that gyrostab ingest wrote.
+    logs
+        Log that gyrostab ingest wrote, or logs in any format.
     output
         NetCDF file to write.
     """
     from gyrostab.davar import davar as compute
-    from gyrostab.export import open_log, to_netcdf
-    from gyrostab.run import check_output, samples_of
+    from gyrostab.export import to_netcdf
+    from gyrostab.run import check_output, load_log, samples_of
 
-    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[log])
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=logs)
     with _work(common) as stage:
-        dataset = open_log(log)
+        stage("reading", 0)
+        dataset = load_log(logs, **reading.options())
         stage("computing", samples_of(dataset))
         to_netcdf(compute(dataset, **windows.options()), target, overwrite=common.overwrite)
     print(target)
@@ -318,8 +187,7 @@ def fit(
     /,
     *,
     output: Output,
-    terms: str = "QNBKR",
-    method: Literal["gls", "adev"] = "gls",
+    fitting: Fitting = Fitting(),
     common: Common = Common(),
 ) -> None:
     """Fit the noise coefficients Q, N, B, K and R in every window of a dynamic Allan variance.
@@ -332,10 +200,6 @@ def fit(
         File that gyrostab davar wrote.
     output
         NetCDF file to write.
-    terms
-        Terms of the model, letters of QNBKR.
-    method
-        gls fits variances with their covariance; adev fits deviations, as some papers do, for comparison.
     """
     from gyrostab.export import open_surface, to_netcdf
     from gyrostab.fit import fit_noise
@@ -344,7 +208,7 @@ def fit(
     target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[surface])
     with _work(common) as stage:
         stage("fitting", 0)
-        to_netcdf(fit_noise(open_surface(surface), terms=terms, method=method), target, overwrite=common.overwrite)
+        to_netcdf(fit_noise(open_surface(surface), **fitting.options()), target, overwrite=common.overwrite)
     print(target)
 
 
@@ -391,7 +255,7 @@ def _config(tokens: Sequence[str]) -> Any:
             name = token.removeprefix("--config=")
     if name is None:
         return None
-    table = _read_toml(Path(name))
+    table = read_toml(Path(name))
     commands = [command for command in app if not command.startswith("-")]
     strange = [key for key, value in table.items() if isinstance(value, dict) and key not in commands]
     if strange:

@@ -29,7 +29,7 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     paths : path, pattern, or several of them
         Logs in any format that gyrostab reads.
     **reading
-        Options of `gyrostab.read.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``.
+        Options of `gyrostab.run.load_log`: those of `gyrostab.read.read_log`, and ``max_gap``.
 
     Returns
     -------
@@ -78,10 +78,12 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.regularise import gap_table, regularise
     from gyrostab.schema import log_channels, signal_name
 
+    max_gap = reading.get("max_gap", "10D")
+    reading = {name: value for name, value in reading.items() if name != "max_gap"}
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
-    log = raw if regular else regularise(raw, rate=reading.get("rate"))
+    log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap=max_gap)
     start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
     gaps = gap_table(log)
     signal = log[signal_name(log)]

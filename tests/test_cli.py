@@ -231,7 +231,6 @@ def test_constant_signal_runs_with_a_note(tmp_path, capfd):
 
 
 def test_stages_refuse_what_is_not_theirs(log, tmp_path, capfd):
-    assert call("davar", log, "-o", tmp_path / "davar.nc", *WINDOW) == 2
     assert call("fit", log, "-o", tmp_path / "product.nc") == 2
     assert call("report", log, "-o", tmp_path / "report.html") == 2
     assert "Traceback" not in capfd.readouterr().err
@@ -254,6 +253,21 @@ def test_run_finds_the_noise_that_was_put_in(product):
     found, error = (dataset[name].isel(time=[0, -1]).values for name in ("N", "N_stderr"))
     assert np.all(np.abs(found - N_TRUE) < 5.0 * error)
     assert np.all(error < 0.1 * N_TRUE)
+
+
+def test_davar_takes_any_log_and_no_product(log, product, tmp_path, capfd):
+    assert call("davar", log, "-o", tmp_path / "davar.nc", *WINDOW) == 0
+    np.testing.assert_array_equal(open_surface(tmp_path / "davar.nc")["avar"], open_product(product)["avar"])
+    capfd.readouterr()
+    assert call("davar", product, "-o", tmp_path / "again.nc", *WINDOW) == 2
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_the_fit_can_start_at_a_longer_averaging_time(log, tmp_path):
+    assert call("run", log, "-o", tmp_path / "late.nc", *WINDOW, "--fit-from", "0.1s", "--terms", "N") == 0
+    late = open_product(tmp_path / "late.nc")
+    assert (late["observable"].sel(term="Q") == 0).all()
+    assert float(late["N"][0, 0]) == pytest.approx(N_TRUE, rel=0.2)
 
 
 def test_the_stages_one_by_one_give_the_same_product(log, product, tmp_path):
