@@ -424,3 +424,23 @@ def test_attributes_of_the_schema_reach_the_file(files):
         for name in ("avar", "edf", "N", "K_upper", "observable"):
             for key, value in attributes(name).items():
                 np.testing.assert_array_equal(file[name].getncattr(key), value)
+
+
+def test_a_flipped_bit_is_noticed(tmp_path):
+    """Every chunk carries a checksum: a damaged copy is refused, not read as other numbers."""
+    path = to_netcdf(synthetic.product(windows=400), tmp_path / "product.nc")
+    with netCDF4.Dataset(path) as stored:
+        assert all(
+            variable.filters()["fletcher32"] for variable in stored.variables.values() if variable.ndim and variable.dtype.kind == "f"
+        )
+    data = bytearray(path.read_bytes())
+    refused = 0
+    for place in range(len(data) // 3, len(data) // 3 + 2000, 100):
+        damaged = tmp_path / "damaged.nc"
+        damaged.write_bytes(bytes(data[:place]) + bytes([data[place] ^ 0x10]) + bytes(data[place + 1 :]))
+        try:
+            with open_product(damaged) as copy:
+                copy.load()
+        except (FormatError, RuntimeError, OSError):
+            refused += 1
+    assert refused >= 15  # a few bytes belong to no chunk
