@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cf_units
 import dask.array as da
+import h5py
 import hypothesis.extra.numpy as hnp
 import netCDF4
 import numpy as np
@@ -429,18 +430,11 @@ def test_attributes_of_the_schema_reach_the_file(files):
 def test_a_flipped_bit_is_noticed(tmp_path):
     """Every chunk carries a checksum: a damaged copy is refused, not read as other numbers."""
     path = to_netcdf(synthetic.product(windows=400), tmp_path / "product.nc")
-    with netCDF4.Dataset(path) as stored:
-        assert all(
-            variable.filters()["fletcher32"] for variable in stored.variables.values() if variable.ndim and variable.dtype.kind == "f"
-        )
-    data = bytearray(path.read_bytes())
-    refused = 0
-    for place in range(len(data) // 3, len(data) // 3 + 2000, 100):
-        damaged = tmp_path / "damaged.nc"
-        damaged.write_bytes(bytes(data[:place]) + bytes([data[place] ^ 0x10]) + bytes(data[place + 1 :]))
-        try:
-            with open_product(damaged) as copy:
-                copy.load()
-        except (FormatError, RuntimeError, OSError):
-            refused += 1
-    assert refused >= 15  # a few bytes belong to no chunk
+    data = path.read_bytes()
+    with h5py.File(path) as stored:
+        chunks = [stored[name].id.get_chunk_info(0) for name in ("avar", "edf", "N", "temperature")]
+    for chunk in chunks:
+        place = chunk.byte_offset + chunk.size // 2
+        path.write_bytes(data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :])
+        with open_product(path) as copy, pytest.raises((RuntimeError, OSError)):
+            copy.load()
