@@ -73,7 +73,7 @@ def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
             kept = np.dtype(variable.encoding.get("dtype", variable.dtype))
             encoding[name] |= {**variable.encoding, "_FillValue": kept.type(netCDF4.default_fillvals[kept.str[1:]])}
         if variable.ndim and variable.size and not text:
-            encoding[name] |= {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True, "chunksizes": _chunks(variable)}
+            encoding[name] |= {"zlib": True, "complevel": 4, "shuffle": True, "chunksizes": _chunks(variable)}
     with new_output(path, overwrite=overwrite) as temporary:
         stored.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
     return Path(path)
