@@ -179,6 +179,7 @@ def _prepare(folder: Path, *, overwrite: bool) -> dict[str, Path]:
 def _draw(log: xr.Dataset, product: xr.Dataset, files: dict[str, Path], *, overwrite: bool) -> None:
     from gyrostab.output import new_output
     from gyrostab.plot import plot_coefficients, plot_davar, plot_davar_3d, plot_signal
+    from gyrostab.plot.style import save_png
 
     axis = str(product["axis"].values[0])
     figures = {
@@ -189,4 +190,4 @@ def _draw(log: xr.Dataset, product: xr.Dataset, files: dict[str, Path], *, overw
     }
     for name, figure in figures.items():
         with new_output(files[name], overwrite=overwrite) as temporary:
-            figure.savefig(temporary, dpi=120, format="png")
+            save_png(figure, temporary, dpi=120)

@@ -15,7 +15,7 @@ import xarray as xr
 
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
-from gyrostab.plot.style import duration
+from gyrostab.plot.style import duration, save_png
 from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_log, check_product
 
 if TYPE_CHECKING:
@@ -268,7 +268,7 @@ def _figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]
 
 def _embed(figure: Figure, alt: str, caption: str) -> dict[str, str]:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
+    save_png(figure, buffer)
     return {"png": base64.b64encode(buffer.getvalue()).decode("ascii"), "alt": alt, "caption": caption}
 
 

@@ -9,7 +9,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import GREY, axis_names, axis_style, new_figure, require_coefficients, shade_spans, time_axis, window_text
+from gyrostab.plot.style import (
+    GREY,
+    align_ylabels,
+    axis_names,
+    axis_style,
+    new_figure,
+    require_coefficients,
+    shade_spans,
+    time_axis,
+    window_text,
+)
 from gyrostab.schema import OBSERVABLE
 
 if TYPE_CHECKING:
@@ -57,13 +67,13 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
                 shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(names))
         _scale(panel, product, symbol, names)
         panel.set_ylabel(f"{symbol} [{law.label}]")
-        panel.set_title(law.name, loc="left", fontsize="medium", pad=3)
+        panel.set_title(law.name, loc="left", fontsize="medium", pad=3, y=1.0)
         panel.grid(alpha=0.3)
     figure.legend(handles=_key(product, names), loc="outside lower center", ncols=len(names) + 3, fontsize="small", frameon=False)
     whose = f" of axis {names[0]}" if len(names) == 1 else ""
     figure.suptitle(", ".join(filter(None, [f"Noise coefficients{whose} over time", window_text(product)])))
-    figure.align_ylabels()
     time_axis(panels[-1], edges)
+    align_ylabels(panels)
     return figure
 
 

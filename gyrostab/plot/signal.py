@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.plot.style import axis_names, axis_style, new_figure, shade_spans, time_axis, unit_label
+from gyrostab.plot.style import align_ylabels, axis_names, axis_style, new_figure, shade_spans, time_axis, unit_label
 from gyrostab.schema import log_channels, signal_name
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[
     rate = log.attrs.get("sampling_rate_hz")
     figure.suptitle(f"{what} as recorded" + (f", {float(rate):g} samples a second" if rate else ""))
     time_axis(panels[-1], log["time"][[0, -1]].values)
-    figure.align_ylabels()
+    align_ylabels(panels)
     return figure
 
 

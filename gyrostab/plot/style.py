@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import os
+from collections.abc import Sequence
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -18,10 +20,12 @@ if TYPE_CHECKING:
 __all__ = [
     "COLOURS",
     "MARKERS",
+    "align_ylabels",
     "axis_names",
     "axis_style",
     "duration",
     "new_figure",
+    "save_png",
     "shade_spans",
     "time_axis",
     "unit_label",
@@ -32,6 +36,7 @@ __all__ = [
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = ("o", "s", "D", "P", "X", "*")
 GREY = "#8c8c8c"
+_DPI = 110
 
 _LABELS = {
     INNER["rate"]: "deg/h",
@@ -94,9 +99,50 @@ def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
 
 def new_figure(width: float, height: float) -> Figure:
     """Make an empty figure [inches] that lays itself out."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=_DPI)
+    FigureCanvasAgg(figure)  # attaches itself; text can be measured from now on
+    return figure
+
+
+def align_ylabels(panels: Sequence[Axes] | NDArray[Any]) -> None:
+    """Put the y labels of panels that stand above each other in one line, left of the widest tick label.
+
+    Matplotlib's own alignment measures every panel for each of them, several times over.
+    """
+    from matplotlib.transforms import ScaledTranslation
+
+    figure: Any = panels[0].figure
+    renderer = figure.canvas.get_renderer()
+    widths = [label.get_window_extent(renderer).width for panel in panels for label in panel.get_yticklabels() if label.get_text()]
+    inches = max(widths, default=0.0) / figure.dpi + 0.14
+    for panel in panels:
+        left = panel.transAxes + ScaledTranslation(-inches, 0.0, figure.dpi_scale_trans)
+        panel.yaxis.set_label_coords(0.0, 0.5, transform=left)
+
+
+def save_png(figure: Figure, target: str | os.PathLike[str] | IO[bytes], *, dpi: int = _DPI) -> None:
+    """Write a figure as PNG in a single pass; ``figure.savefig`` makes two, and lays the figure out in each.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        The figure.
+    target : path-like or binary file
+        Where to write.
+    dpi : int
+        Pixels per inch.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    before = figure.dpi
+    try:
+        figure.set_dpi(dpi)
+        FigureCanvasAgg(figure).print_png(target, pil_kwargs={"compress_level": 3})  # type: ignore[no-untyped-call]
+    finally:
+        figure.set_dpi(before)
 
 
 def time_axis(ax: Axes, times: NDArray[Any]) -> None:

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.plot.style import axis_names, new_figure, time_axis, window_text
+from gyrostab.plot.style import align_ylabels, axis_names, new_figure, time_axis, window_text
 from gyrostab.schema import ESTIMATORS, check_surface
 
 if TYPE_CHECKING:
@@ -68,14 +68,17 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
         shown = np.ma.masked_invalid(np.where(deviation > 0, deviation, np.nan))
         mesh = panel.pcolormesh(time_edges, tau_edges, shown.T, norm=norm, cmap=CHANGE_CMAP if relative else CMAP, rasterized=True)
         _mark_weighted(panel, time_edges, tau, weighted)
-        panel.set_yscale("log")
+        panel.set_yscale("log", subs=(2, 5))
         panel.set_ylabel(f"axis {name}\naveraging time τ [s]")
     label = "σ(τ) / its median over time" if relative else "Allan deviation σ(τ) [deg/h]"
     _colour_bar(figure, mesh, list(panels), label, relative=relative)
-    handles: list[Any] = [Patch(facecolor="#d0d0d0", edgecolor="#909090", hatch="////", label="no estimate (gap, or too few terms)")]
+    handles: list[Any] = []
+    if any(not (deviation > 0).all() for deviation, _ in cells):
+        handles.append(Patch(facecolor="#d0d0d0", edgecolor="#909090", hatch="////", label="no estimate (gap, or too few terms)"))
     if any(weighted.any() for _, weighted in cells):
         handles.append(_dot_key())
-    figure.legend(handles=handles, loc="outside lower left", ncols=2, fontsize="small", frameon=False)
+    if handles:
+        figure.legend(handles=handles, loc="outside lower left", ncols=2, fontsize="small", frameon=False)
     text = ", ".join(
         filter(
             None,
@@ -88,10 +91,11 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
     )
     figure.suptitle(text)
     time_axis(panels[-1], time_edges)
+    align_ylabels(panels)
     return figure
 
 
-def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int = 150) -> Figure:
+def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int = 120) -> Figure:
     """Draw the Allan deviation of one axis as a surface over time and log averaging time.
 
     Parameters
