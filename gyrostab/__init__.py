@@ -26,12 +26,14 @@ if TYPE_CHECKING:
     from gyrostab.export import to_netcdf as to_netcdf
     from gyrostab.export import to_zarr as to_zarr
     from gyrostab.fit import fit_noise as fit_noise
+    from gyrostab.kalibr import to_kalibr as to_kalibr
     from gyrostab.log import make_log as make_log
     from gyrostab.plot import plot_adev as plot_adev
     from gyrostab.plot import plot_coefficients as plot_coefficients
     from gyrostab.plot import plot_davar as plot_davar
     from gyrostab.plot import plot_davar_3d as plot_davar_3d
     from gyrostab.plot import plot_signal as plot_signal
+    from gyrostab.plot import save_figures as save_figures
     from gyrostab.read import read_log as read_log
     from gyrostab.regularise import gap_table as gap_table
     from gyrostab.regularise import regularise as regularise
@@ -55,7 +57,9 @@ _HOME = {
     "plot_signal": "plot",
     "read_log": "read",
     "regularise": "regularise",
+    "save_figures": "plot",
     "scan": "scan",
+    "to_kalibr": "kalibr",
     "to_netcdf": "export",
     "to_zarr": "export",
     "write_report": "report",
@@ -78,7 +82,9 @@ __all__ = [
     "plot_signal",
     "read_log",
     "regularise",
+    "save_figures",
     "scan",
+    "to_kalibr",
     "to_netcdf",
     "to_zarr",
     "write_report",

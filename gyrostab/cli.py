@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any, Literal, TextIO
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -242,6 +242,68 @@ def report(
     with _work(common) as stage:
         stage("drawing", 0)
         write_report(open_product(product), target, log=open_log(log) if log else None, overwrite=common.overwrite)
+    print(target)
+
+
+@app.command(sort_key=8, help_epilogue="")
+def plot(
+    product: Annotated[Path, Parameter(name="PRODUCT")],
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")],
+    common: Common = Common(),
+) -> None:
+    """Draw all the figures of a product as PNG: coefficients, dynamic Allan deviation as map and as surface, one window of each axis.
+
+    Example: gyrostab plot product.nc -o figures
+
+    Parameters
+    ----------
+    product
+        File that gyrostab run or gyrostab fit wrote.
+    output
+        Folder to write into.
+    """
+    from gyrostab.export import open_product
+    from gyrostab.plot.figures import save_figures
+
+    with _work(common) as stage:
+        stage("drawing", 0)
+        files = save_figures(open_product(product), output, overwrite=common.overwrite)
+    print(*files, sep="\n")
+
+
+@app.command(sort_key=9, help_epilogue="")
+def export(
+    product: Annotated[Path, Parameter(name="PRODUCT")],
+    /,
+    *,
+    output: Output,
+    format: Literal["kalibr", "zarr"],
+    common: Common = Common(),
+) -> None:
+    """Hand a product over to other programs: the noise for Kalibr and the ROS tools (YAML), or the whole product as Zarr.
+
+    Example: gyrostab export product.nc -o imu.yaml --format kalibr
+
+    Parameters
+    ----------
+    product
+        File that gyrostab run or gyrostab fit wrote.
+    output
+        File to write (YAML), or directory (Zarr).
+    format
+        kalibr: N, K and B in radians, the worst axis and each of them; zarr: everything.
+    """
+    from gyrostab.export import open_product, to_zarr
+    from gyrostab.kalibr import to_kalibr
+    from gyrostab.run import check_output
+
+    write, suffixes = {"kalibr": (to_kalibr, [".yaml", ".yml"]), "zarr": (to_zarr, [".zarr"])}[format]
+    target = check_output(output, suffixes=suffixes, overwrite=common.overwrite, inputs=[product])
+    with _work(common) as stage:
+        stage("writing", 0)
+        write(open_product(product), target, overwrite=common.overwrite)
     print(target)
 
 

@@ -1,0 +1,162 @@
+"""The noise of a gyro as Kalibr and the ROS tools state it: continuous-time densities in radians, in a YAML file.
+
+==========================  ================  =========  =======================================
+key                         unit              from       factor
+==========================  ================  =========  =======================================
+gyroscope_noise_density     rad/s/sqrt(Hz)    N          pi / 180 / 60, N in deg/sqrt(h)
+gyroscope_random_walk       rad/s^2/sqrt(Hz)  K          pi / 180 / 3600^1.5, K in deg/h^1.5
+gyroscope_bias_instability  rad/s             B          pi / 180 / 3600, B in deg/h
+update_rate                 Hz                           sampling rate of the log
+==========================  ================  =========  =======================================
+
+Kalibr itself knows no bias instability and passes its key over. The floor of the Allan deviation lies at 0.664 of it.
+
+References
+----------
+Kalibr wiki, "IMU Noise Model": the white noise is read off the Allan deviation at 1 s, the random walk at 3 s.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import SchemaError
+from gyrostab.noise import LAWS
+from gyrostab.output import new_output
+from gyrostab.schema import OBSERVABLE, check_product
+
+__all__ = ["KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]
+
+_LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
+
+#: Key -> symbol of the term, factor from the unit of the field, unit of Kalibr.
+KEYS = {
+    "gyroscope_noise_density": ("N", math.pi / 180.0 / 60.0, "rad/s/sqrt(Hz)"),
+    "gyroscope_random_walk": ("K", math.pi / 180.0 / 3600.0**1.5, "rad/s^2/sqrt(Hz)"),
+    "gyroscope_bias_instability": ("B", math.pi / 180.0 / 3600.0, "rad/s"),
+}
+
+
+@dataclass(frozen=True)
+class KalibrValue:
+    """One number for Kalibr.
+
+    Attributes
+    ----------
+    value : float
+        Median over the windows that observe the term, else of their upper limits [unit of the key in `KEYS`]; NaN when there is neither.
+    meaning : str
+        What the value is.
+    share : float
+        Share of the windows that it is the median of [1].
+    """
+
+    value: float
+    meaning: Literal["observed", "upper_limit_only", "not_observable"]
+    share: float
+
+
+def kalibr_noise(product: xr.Dataset) -> dict[str, dict[str, KalibrValue]]:
+    """Noise of each axis in the units of Kalibr.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product with ``N`` [deg/sqrt(h)], ``K`` [deg/h^1.5], ``B`` [deg/h] and their upper limits, dims ``(axis, time)``.
+
+    Returns
+    -------
+    dict
+        Axis to key of `KEYS` to `KalibrValue`.
+
+    Raises
+    ------
+    SchemaError
+        When it is no product.
+    """
+    check_product(product)
+    return {
+        str(axis): {key: _median(product.sel(axis=axis), symbol, factor) for key, (symbol, factor, _) in KEYS.items()}
+        for axis in product["axis"].values
+    }
+
+
+def _median(part: xr.Dataset, symbol: str, factor: float) -> KalibrValue:
+    state = part["observable"].sel(term=symbol).values
+    for flag, name in ((_SEEN, symbol), (_LIMIT, f"{symbol}_upper")):
+        values = np.where(state == flag, part[name].values, np.nan)
+        if np.isfinite(values).any():
+            return KalibrValue(float(np.nanmedian(values)) * factor, OBSERVABLE[flag], float(np.isfinite(values).mean()))  # type: ignore[arg-type]
+    return KalibrValue(math.nan, "not_observable", 0.0)
+
+
+def to_kalibr(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+    """Write N, K and B as a YAML file for Kalibr: the worst axis at the top, where Kalibr looks, and each axis below.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens, with the attribute ``sampling_rate_hz``.
+    path : path-like
+        The file to make.
+    overwrite : bool
+        Replace an existing file.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    SchemaError
+        When it is no product, or does not say the sampling rate.
+    OutputError
+        When the file exists, or cannot be written.
+    """
+    noise = kalibr_noise(product)
+    rate = product.attrs.get("sampling_rate_hz")
+    if rate is None:
+        raise SchemaError("the product has no attribute 'sampling_rate_hz', which is Kalibr's update_rate; give it one in Hz")
+    files = product.attrs.get("source_files", [])
+    names = [files] if isinstance(files, str) else list(files)
+    lines = [
+        "# Noise of a gyro for Kalibr: medians over the windows of a dynamic Allan variance, made by gyrostab",
+        f"# from {', '.join(Path(name).name for name in names) or 'a log'}. At the top the worst axis, below each of them.",
+        "# Kalibr also asks for rostopic, accelerometer_noise_density and accelerometer_random_walk: a gyro log does not tell them.",
+        f"update_rate: {float(rate)!r}  # Hz",
+    ]
+    for key in KEYS:
+        lines += _entry(key, _worst([values[key] for values in noise.values()]), indent="")
+    lines.append("axes:")
+    for axis, values in noise.items():
+        lines.append(f'  "{axis}":')
+        for key, value in values.items():
+            lines += _entry(key, value, indent="    ")
+    with new_output(path, overwrite=overwrite) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return Path(path)
+
+
+def _worst(values: list[KalibrValue]) -> KalibrValue:
+    """The largest value that any axis may have; an axis that tells nothing leaves it to the others."""
+    known = [value for value in values if not math.isnan(value.value)]
+    return max(known, key=lambda value: value.value) if known else values[0]
+
+
+def _entry(key: str, found: KalibrValue, *, indent: str) -> list[str]:
+    symbol, _, unit = KEYS[key]
+    said = {
+        "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, observed in {found.share:.0%} of the windows",
+        "upper_limit_only": f"{unit}; 95 % UPPER LIMIT: no window observes {symbol} ({LAWS[symbol].name}), {found.share:.0%} bound it",
+        "not_observable": f"{unit}; not observable in any window: a longer --window may show {symbol} ({LAWS[symbol].name})",
+    }[found.meaning]
+    number = "null" if math.isnan(found.value) else f"{found.value:.6e}"
+    return [f"{indent}{key}: {number}  # {said}", f"{indent}{key}_meaning: {found.meaning}"]

@@ -1,0 +1,96 @@
+"""All the figures of a product, as files."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import xarray as xr
+
+from gyrostab.errors import OutputError
+from gyrostab.output import new_output
+from gyrostab.plot.adev import plot_adev
+from gyrostab.plot.coefficients import plot_coefficients
+from gyrostab.plot.style import save_png
+from gyrostab.plot.surface import plot_davar, plot_davar_3d
+from gyrostab.schema import check_product
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["product_figures", "save_figures"]
+
+
+def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
+    """List the figures of a product by name; each is drawn when it is called.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens.
+
+    Returns
+    -------
+    dict
+        ``coefficients``, ``davar``, ``davar_change``, and for each axis ``adev_<axis>`` and ``davar_3d_<axis>``; the surface in three
+        dimensions only where there are two windows and two averaging times at least.
+
+    Raises
+    ------
+    SchemaError
+        When it is no product.
+    """
+    check_product(product)
+    figures: dict[str, Callable[[], Figure]] = {
+        "coefficients": lambda: plot_coefficients(product),
+        "davar": lambda: plot_davar(product),
+        "davar_change": lambda: plot_davar(product, relative=True),
+    }
+    for axis in map(str, product["axis"].values):
+        figures[f"adev_{axis}"] = lambda axis=axis: plot_adev(product, axis)  # type: ignore[misc]
+        if min(product.sizes["time"], product.sizes["tau"]) > 1:
+            figures[f"davar_3d_{axis}"] = lambda axis=axis: plot_davar_3d(product, axis=axis)  # type: ignore[misc]
+    return figures
+
+
+def save_figures(product: xr.Dataset, folder: str | os.PathLike[str], *, dpi: int = 150, overwrite: bool = False) -> list[Path]:
+    """Write all the figures of a product into a folder, as PNG.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens.
+    folder : path-like
+        Where to write; it is made when it does not exist.
+    dpi : int
+        Pixels per inch; 150 is enough for print.
+    overwrite : bool
+        Replace figures that exist.
+
+    Returns
+    -------
+    list of pathlib.Path
+        The files, named as in `product_figures`.
+
+    Raises
+    ------
+    SchemaError
+        When it is no product.
+    OutputError
+        When a figure exists and `overwrite` is not given (none is written then), or when the folder cannot be written to.
+    """
+    folder = Path(folder)
+    figures = {folder / (re.sub(r"[^\w.-]", "_", name) + ".png"): draw for name, draw in product_figures(product).items()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"folder {str(folder)!r} cannot be made ({error.strerror}); give another one with -o") from error
+    if not overwrite and (there := [path.name for path in figures if path.exists()]):
+        raise OutputError(f"{folder} holds {', '.join(there)} already; give --overwrite to replace them, or another folder with -o")
+    for path, draw in figures.items():
+        with new_output(path, overwrite=overwrite) as temporary:
+            save_png(draw(), temporary, dpi=dpi)
+    return list(figures)
