@@ -1,0 +1,202 @@
+"""The channel that may drive the gyro: aligned to the windows by averaging inside each, shifted by every lag, and its rate of change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError, SchemaError, TimeError
+from gyrostab.kernels.trend import window_trend
+from gyrostab.noise import HOUR
+from gyrostab.units import INNER
+
+__all__ = ["Driver", "drivers", "other_channels", "slope_units"]
+
+Array = NDArray[np.float64]
+
+# Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS takes "g" for the gram.
+_DIFFERENCE = {"degree_Celsius": "K", "g": "standard_free_fall", "9.80665": "standard_free_fall"}
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A channel, or its rate of change, by (lag, window)."""
+
+    name: str
+    label: str
+    units: str
+    values: Array
+
+
+def drivers(product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.int64], step: float) -> list[Driver]:
+    """Channel and its rate of change, averaged inside the windows, for every lag.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product with ``time`` and ``time_bounds``.
+    channel : str or DataArray
+        Channel of the product, or one on a time of its own.
+    lags : int64 (n_lags,)
+        Lags [steps]; the channel is taken that much earlier than the gyro.
+    step : float
+        Step of the windows [s].
+
+    Returns
+    -------
+    list of Driver
+        Two; NaN where the channel is not known. Gaps shorter than a tenth of the record are bridged, nothing is extrapolated.
+    """
+    if isinstance(channel, str):
+        if channel not in product.data_vars or product[channel].dims != ("time",):
+            there = ", ".join(_channels(product)) or "none"
+            raise OptionError(f"the product has no channel {channel!r}; it has {there}; give another, or a file with --channel")
+        name, units = channel, str(product[channel].attrs.get("units", "1"))
+        both = _of_product(product, channel, lags, step)
+    else:
+        name, units = _name(channel, product), str(channel.attrs.get("units", "1"))
+        both = _of_file(channel, product, lags, step)
+    label = name.replace("_", " ")
+    return [
+        Driver(name, label, units, both[0]),
+        Driver(f"{name}_rate", f"rate of change of {label}", _times(_difference(units), {"hour": -1}), both[1]),
+    ]
+
+
+def other_channels(product: xr.Dataset, driver: str) -> list[str]:
+    """Channels of the product beside the driver and what is derived from it."""
+    return [name for name in _channels(product) if name not in (driver, f"{driver}_rate") and f"{name}_rate" != driver]
+
+
+def _channels(product: xr.Dataset) -> list[str]:
+    numeric = (name for name, v in product.data_vars.items() if v.dims == ("time",) and v.dtype.kind == "f")
+    return [str(name) for name in numeric]
+
+
+def _name(channel: xr.DataArray, product: xr.Dataset) -> str:
+    name = str(channel.name or "channel")
+    return f"{name}_of_file" if name in product.variables else name
+
+
+def _nanoseconds(stamps: Any) -> NDArray[np.int64]:
+    return np.asarray(stamps).astype("datetime64[ns]").astype(np.int64)
+
+
+def _grid(product: xr.Dataset, step: float) -> NDArray[np.int64]:
+    time = _nanoseconds(product["time"].values)
+    return np.rint((time - time[0]) / 1e9 / step).astype(np.int64)
+
+
+def _lagged(whole: Array, before: int, place: NDArray[np.int64], lags: NDArray[np.int64]) -> Array:
+    """Values that lie each lag earlier, of a row on the grid of windows that begins `before` steps ahead of the first window."""
+    at = place[None, :] - lags[:, None] + before
+    return np.where(at >= 0, whole[np.maximum(at, 0)], np.nan)
+
+
+def _bridged(whole: Array) -> Array:
+    """Draw a line across holes no longer than a tenth of the row; ends stay as they are."""
+    known = np.flatnonzero(np.isfinite(whole))
+    wide = np.diff(known)
+    for hole in np.flatnonzero((wide > 1) & (wide <= max(3.0, 0.1 * whole.size))):
+        left, right = known[hole], known[hole + 1]
+        whole[left : right + 1] = np.linspace(whole[left], whole[right], right - left + 1)
+    return whole
+
+
+def _of_product(product: xr.Dataset, name: str, lags: NDArray[np.int64], step: float) -> list[Array]:
+    place = _grid(product, step)
+    mean = np.full(int(place[-1]) + 1, np.nan)
+    mean[place] = product[name].values
+    mean = _bridged(mean)
+    if f"{name}_rate" in product.data_vars:
+        rate = np.full(mean.size, np.nan)
+        rate[place] = product[f"{name}_rate"].values
+        rate = _bridged(rate)
+    else:
+        rate = _slope(mean, step)
+    return [_lagged(row, 0, place, lags) for row in (mean, rate)]
+
+
+def _slope(mean: Array, step: float) -> Array:
+    """Rate of change [1/hour] of a row of window means, from its neighbours."""
+    slope = np.full(mean.size, np.nan)
+    slope[1:-1] = (mean[2:] - mean[:-2]) / (2.0 * step / HOUR)
+    return slope
+
+
+def _of_file(channel: xr.DataArray, product: xr.Dataset, lags: NDArray[np.int64], step: float) -> list[Array]:
+    """Mean and slope of a channel on its own time inside the windows, from the longest lag before the first window on."""
+    values, stamps = _checked(channel, product)
+    place, before = _grid(product, step), int(lags[-1])
+    bounds = _nanoseconds(product["time_bounds"].values)
+    start = bounds[0, 0] + np.rint(np.arange(-before, place[-1] + 1) * step * 1e9).astype(np.int64)
+    start[before + place] = bounds[:, 0]
+    length = int(np.median(bounds[:, 1] - bounds[:, 0]))
+    first, last = np.searchsorted(stamps, start), np.searchsorted(stamps, start + length)
+    mean, rate = window_trend(values, (stamps - stamps[0]) / 1e9, first, last)
+    sparse = np.isfinite(rate).sum() < 0.5 * np.isfinite(mean).sum()
+    mean = _bridged(mean)
+    rate = _slope(mean, step) if sparse else _bridged(rate * HOUR)
+    return [_lagged(row, before, place, lags) for row in (mean, rate)]
+
+
+def _checked(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray[np.int64]]:
+    if channel.ndim != 1 or channel.dtype.kind not in "iuf":
+        raise SchemaError(f"channel {channel.name!r} must be numbers along one dimension of time; it has dimensions {channel.dims}")
+    dim = channel.dims[0]
+    if dim not in channel.coords or channel[dim].dtype.kind != "M":
+        raise SchemaError(f"channel {channel.name!r} has no coordinate {dim!r} of dates; give it one")
+    good = np.isfinite(channel.values) & ~np.isnat(channel[dim].values)
+    stamps = _nanoseconds(channel[dim].values[good])
+    order = np.argsort(stamps, kind="stable")
+    stamps, values = stamps[order], channel.values[good][order].astype(np.float64)
+    bounds = _nanoseconds(product["time_bounds"].values)
+    if not stamps.size or stamps[-1] < bounds[0, 0] or stamps[0] >= bounds[-1, 1]:
+        said = "holds no value" if not stamps.size else f"spans {_day(stamps[0])} to {_day(stamps[-1])}"
+        raise TimeError(
+            f"channel {channel.name!r} {said}, the product {_day(bounds[0, 0])} to {_day(bounds[-1, 1])}: they do not overlap; "
+            "check the file, or the zero of its time with --epoch"
+        )
+    return values, stamps
+
+
+def _day(stamp: Any) -> str:
+    return str(np.datetime64(int(stamp), "ns").astype("datetime64[s]"))
+
+
+def _powers(units: str) -> dict[str, int]:
+    powers: dict[str, int] = {}
+    for word in units.split():
+        bare = word.rstrip("-0123456789") or word
+        powers[bare] = powers.get(bare, 0) + int(word[len(bare) :] or 1)
+    powers.pop("1", None)
+    return powers
+
+
+def _difference(units: str) -> str:
+    """Unit of a difference: kelvin for degrees Celsius."""
+    return " ".join(_DIFFERENCE.get(word, word) for word in units.split())
+
+
+def _times(units: str, more: dict[str, int]) -> str:
+    powers = _powers(units)
+    for name, power in more.items():
+        powers[name] = powers.get(name, 0) + power
+    words = [name if power == 1 else f"{name}{power}" for name, power in powers.items() if power]
+    return " ".join(words) or "1"
+
+
+def slope_units(units: str, driver: str) -> str:
+    """Unit of a sensitivity, spelled for UDUNITS.
+
+    Examples
+    --------
+    >>> slope_units(INNER["rate"], INNER["temperature"]), slope_units("microradian", "K hour-1")
+    ('degree hour-1 K-1', 'microradian K-1 hour')
+    """
+    below = {name: -power for name, power in _powers(_difference(driver)).items()}
+    return _times(_difference(units) if units in INNER.values() else units, below)

@@ -1,0 +1,69 @@
+"""What a record can tell of a coupling, in flags and in one sentence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LIMITS", "VERDICTS", "driver_limits", "statement"]
+
+Array = NDArray[np.float64]
+
+#: Flag values of ``coupling_verdict``.
+VERDICTS = ("cannot_tell", "none_seen", "not_told_apart", "coupled")
+
+#: Bit -> name of ``coupling_limits``, and how a sentence says it.
+LIMITS = {
+    "constant": "{driver} is constant",
+    "too_few": "there are too few independent windows",
+    "clusters": "{driver} only differs between stretches that a gap parts",
+    "no_reversal": "{driver} never turns, so a drift in time looks the same",
+    "no_plateau": "{driver} never rests, so a lasting effect and one of its rate of change look alike",
+    "other_channel": "another channel explains it as well",
+}
+_FEWEST = 10
+_QUANTUM = {"degree_Celsius": 0.02}  # a smaller range of the channel counts as none
+
+
+def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: bool) -> set[str]:
+    """Say why a driver may not tell, from its block means `x` in the stretches `pieces` between long gaps."""
+    found = set()
+    span = float(np.ptp(x)) if x.size else 0.0
+    if x.size < _FEWEST:
+        found.add("too_few")
+    if span <= max(_QUANTUM.get(units, 0.0), 1e-9 * float(np.abs(x).max(initial=0.0))):
+        return found | {"constant"}
+    inside = sum(float(((x[pieces == piece] - x[pieces == piece].mean()) ** 2).sum()) for piece in np.unique(pieces))
+    if pieces.max() > 0 and inside < 0.1 * float(((x - x.mean()) ** 2).sum()):
+        found.add("clusters")
+    rise = float((x - np.minimum.accumulate(x)).max())
+    fall = float((np.maximum.accumulate(x) - x).max())
+    if min(rise, fall) < 0.25 * span:
+        found.add("no_reversal")
+    if not derived and x.size >= _FEWEST:
+        pace = np.abs(np.gradient(x))
+        if np.mean(pace < 0.1 * np.quantile(pace, 0.95)) < 0.1:
+            found.add("no_plateau")
+    return found
+
+
+def statement(entry: dict[str, Any], driver: str, series: str) -> str:
+    """One sentence of plain words about an entry."""
+    reasons = [LIMITS[name].format(driver=driver) for name in LIMITS if name in entry["limits"]]
+    verdict = VERDICTS[entry["verdict"]]
+    if verdict == "cannot_tell":
+        hard = [LIMITS[name].format(driver=driver) for name in ("constant", "too_few", "clusters") if name in entry["limits"]]
+        return f"The record cannot tell whether {series} follows {driver}: {'; '.join(hard) or 'no window holds both'}."
+    number = f"{entry['slope']:.3g} ({entry['low']:.3g} to {entry['high']:.3g}) {entry['units']}"
+    chance = f"p = {max(entry['p_adjusted'], 1e-99):.2g} for the whole search"
+    late = f" {entry['lag']:.3g} s later" if entry["lag"] else ""
+    if verdict == "none_seen":
+        tail = f" ({'; '.join(reasons)})" if reasons else ""
+        return f"No coupling of {series} with {driver} is seen: {number}, {chance}{tail}."
+    if verdict == "not_told_apart":
+        return f"{series[0].upper()}{series[1:]} goes with {driver}{late}, {number}, {chance}, but {'; '.join(reasons)}."
+    return (
+        f"{series[0].upper()}{series[1:]} follows {driver}{late}: {number}, {chance}{' (' + '; '.join(reasons) + ')' if reasons else ''}."
+    )
