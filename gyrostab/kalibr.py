@@ -18,6 +18,7 @@ Kalibr wiki, "IMU Noise Model": the white noise is read off the Allan deviation 
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from dataclasses import dataclass
@@ -137,7 +138,7 @@ def to_kalibr(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
         lines += _entry(key, _worst([values[key] for values in noise.values()]), indent="")
     lines.append("axes:")
     for axis, values in noise.items():
-        lines.append(f'  "{axis}":')
+        lines.append(f"  {json.dumps(axis)}:")
         for key, value in values.items():
             lines += _entry(key, value, indent="    ")
     with new_output(path, overwrite=overwrite) as temporary:
