@@ -85,7 +85,7 @@ def _theta(x: NDArray[np.generic], present: NDArray[np.bool_], angle: bool) -> t
         line = values[first] + slope * (np.arange(values.size) - first)
         theta = np.where(present, values - line, 0.0)
         return theta, theta, False
-    offset = float(np.mean(values, where=present))
+    offset = float(np.mean(values) if present.all() else np.mean(values, where=present))
     if not np.issubdtype(x.dtype, np.floating):
         offset = float(np.rint(offset))  # integer counts less an integer: every sum is exact
     theta = integrate(values, present, offset)
