@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo-output
 
-.PHONY: demo test lint bench real-recordings clean-kernels clean help
+.PHONY: demo test lint bench real-recordings interop baseline clean-kernels clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
@@ -39,6 +39,12 @@ bench: $(VENV)/.installed-test  ## time the kernels beside their peers
 
 real-recordings: $(VENV)/.installed  ## remake docs/real-recordings.md from the recordings, where they are present
 	$(BIN)/python pipelines/real_recordings.py
+
+interop: $(VENV)/.installed-test  ## open the files in other programs, those that are installed (Debian: octave octave-netcdf netcdf-bin)
+	$(BIN)/python -m pytest -n0 -v tests/interop
+
+baseline: $(VENV)/.installed-test  ## remake the pictures that the figures are compared with; look at them afterwards
+	$(BIN)/python -m tests.test_figures
 
 clean-kernels:  ## forget the compiled kernels
 	find gyrostab -name '*.nb[ic]' -delete

@@ -146,7 +146,7 @@ def _attributes_to_disk(attrs: dict[str, Any]) -> dict[str, Any]:
         if isinstance(value, str) or (isinstance(value, int | float) and not isinstance(value, bool)):
             continue
         if not isinstance(value, np.ndarray):
-            attrs[name] = json.dumps(value, default=str, ensure_ascii=False)
+            attrs[name] = json.dumps(value, default=str)  # in ASCII: Octave lists no file that has any other global attribute
             coded.append(name)
     if coded:
         attrs[_JSON_NAMES] = " ".join(coded)
@@ -167,7 +167,8 @@ def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, A
     if given.get("title") in (None, *TITLES.values()):  # a title of ours may stem from an earlier stage
         given["title"] = TITLES[kind]
     names = [files] if isinstance(files, str) else [str(name) for name in files]
-    given.setdefault("source", "gyro log: " + ", ".join(names) if names else "gyro log")
+    source = "gyro log: " + ", ".join(names) if names else "gyro log"
+    given.setdefault("source", source.encode("ascii", "backslashreplace").decode())
     given |= {"Conventions": CONVENTIONS, "date_created": now, "gyrostab_version": version, "gyrostab_content": kind}
     given.setdefault("references", "IEEE Std 952; Wang et al., Sensors 16 (2016) 2081 (dynamic Allan variance of gyros with missing data)")
     times = dataset.get("time")
