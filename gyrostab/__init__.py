@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gyrostab.confidence import confidence_interval as confidence_interval
+    from gyrostab.correlate import correlate as correlate
     from gyrostab.davar import davar as davar
     from gyrostab.export import open_log as open_log
     from gyrostab.export import open_product as open_product
@@ -30,10 +31,12 @@ if TYPE_CHECKING:
     from gyrostab.log import make_log as make_log
     from gyrostab.plot import plot_adev as plot_adev
     from gyrostab.plot import plot_coefficients as plot_coefficients
+    from gyrostab.plot import plot_correlation as plot_correlation
     from gyrostab.plot import plot_davar as plot_davar
     from gyrostab.plot import plot_davar_3d as plot_davar_3d
     from gyrostab.plot import plot_signal as plot_signal
     from gyrostab.plot import save_figures as save_figures
+    from gyrostab.read import read_channel as read_channel
     from gyrostab.read import read_log as read_log
     from gyrostab.regularise import gap_table as gap_table
     from gyrostab.regularise import regularise as regularise
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
 # public name -> module that holds it
 _HOME = {
     "confidence_interval": "confidence",
+    "correlate": "correlate",
     "davar": "davar",
     "fit_noise": "fit",
     "gap_table": "regularise",
@@ -52,9 +56,11 @@ _HOME = {
     "open_surface": "export",
     "plot_adev": "plot",
     "plot_coefficients": "plot",
+    "plot_correlation": "plot",
     "plot_davar": "plot",
     "plot_davar_3d": "plot",
     "plot_signal": "plot",
+    "read_channel": "read",
     "read_log": "read",
     "regularise": "regularise",
     "save_figures": "plot",
@@ -68,6 +74,7 @@ _HOME = {
 __all__ = [
     "__version__",
     "confidence_interval",
+    "correlate",
     "davar",
     "fit_noise",
     "gap_table",
@@ -77,9 +84,11 @@ __all__ = [
     "open_surface",
     "plot_adev",
     "plot_coefficients",
+    "plot_correlation",
     "plot_davar",
     "plot_davar_3d",
     "plot_signal",
+    "read_channel",
     "read_log",
     "regularise",
     "save_figures",

@@ -245,6 +245,61 @@ def report(
     print(target)
 
 
+@app.command(sort_key=7, help_epilogue="")
+def correlate(
+    product: Annotated[Path, Parameter(name="PRODUCT")],
+    /,
+    *,
+    with_: Annotated[str, Parameter(name="--with", metavar="CHANNEL")] = "temperature",
+    max_lag: Annotated[str | None, Parameter(metavar="DURATION")] = None,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"], metavar="FILE")] = None,
+    reading: Reading = Reading(),
+    common: Common = Common(),
+) -> None:
+    """Say whether noise coefficients and window means follow temperature or another channel, how much and how late.
+
+    Example: gyrostab correlate product.nc --with temperature --max-lag 2h -o coupling.nc
+
+    Parameters
+    ----------
+    product
+        File that gyrostab run or gyrostab fit wrote.
+    with_
+        Channel of the product, or of the file given by --channel.
+    max_lag
+        Longest time by which the gyro may follow the channel (default: a tenth of the record; 0s for none).
+    output
+        NetCDF file to write: the product with the correlation beside it; a figure of the same name in PNG stands beside it.
+    """
+    from gyrostab.correlate import correlate as compute
+    from gyrostab.correlate import format_correlation, join
+    from gyrostab.export import open_product, to_netcdf
+    from gyrostab.output import new_output
+    from gyrostab.plot.correlation import plot_correlation
+    from gyrostab.plot.style import save_png
+    from gyrostab.read.channel import read_channel
+    from gyrostab.run import check_output
+
+    options = reading.options()
+    files = options.pop("channel", ())
+    if len(files) > 1:
+        raise OptionError(f"--channel: {len(files)} files were given; give the one that holds {with_}")
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[product, *files]) if output else None
+    picture = check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
+    with _work(common) as stage:
+        stage("correlating", 0)
+        dataset = open_product(product)
+        given = {name: value for name, value in options.items() if name in ("epoch", "map", "unit")}
+        found = compute(dataset, channel=read_channel(files[0], with_, **given) if files else with_, max_lag=max_lag)
+        if target and picture:
+            to_netcdf(join(dataset, found), target, overwrite=common.overwrite)
+            with new_output(picture, overwrite=common.overwrite) as temporary:
+                save_png(plot_correlation(found), temporary)
+    print(format_correlation(found))
+    if target:
+        print(f"\n{target}\n{picture}")
+
+
 @app.command(sort_key=8, help_epilogue="")
 def plot(
     product: Annotated[Path, Parameter(name="PRODUCT")],

@@ -56,7 +56,7 @@ def product(
     gap: bool = True,
     terms: bool = True,
 ) -> xr.Dataset:
-    """A product whose x axis follows temperature by `slope` [deg/h/K] and its rate by `pace`, `lag` steps late; the other axes follow nothing."""
+    """A product whose x axis follows temperature by `slope` [deg/h/K] and its rate by `pace`, `lag` steps late; the others follow nothing."""
     rng = np.random.default_rng(seed)
     head = 40
     cells = windows + 1
@@ -74,8 +74,9 @@ def product(
     made["window_mean"] = (("axis", "time"), 10 + pair(series), attributes("window_mean"))
     made["window_coverage"] = (("axis", "time"), np.ones(shape), attributes("window_coverage"))
     for term in TERMS:
-        level = 0.01 * (1 + 0.1 * pair(noise("flicker" if noises == "flicker" else "white", cells, rng)))
-        made[term] = (("axis", "time"), np.broadcast_to(level, shape) * rng.uniform(0.98, 1.02, shape), attributes(term))
+        kind = "flicker" if noises == "flicker" else "white"
+        level = 0.01 * np.stack([1 + 0.1 * pair(noise(kind, cells, rng)) for _ in axes])
+        made[term] = (("axis", "time"), level, attributes(term))
     seen = np.zeros((*shape, len(TERMS)), np.int8)
     if terms:
         seen[..., [1, 2]] = 2
@@ -88,7 +89,7 @@ def product(
         axis=("axis", list(axes), attributes("axis")),
         tau=("tau", [1.0], attributes("tau")),
         term=("term", list(TERMS), attributes("term")),
-        time=("time", ends.mean(axis=1) if False else start + np.timedelta64(int(WINDOW * 5e8), "ns"), attributes("time")),
+        time=("time", start + np.timedelta64(int(WINDOW * 5e8), "ns"), attributes("time")),
         time_bounds=(("time", "bnds"), ends),
     )
     made.attrs = {"window_s": WINDOW, "step_s": STEP, "sampling_rate_hz": 100.0}

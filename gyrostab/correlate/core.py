@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.special import stdtr
 
 from gyrostab.correlate.dataset import assemble
 from gyrostab.correlate.drivers import Driver, drivers, other_channels, slope_units
@@ -24,8 +25,9 @@ Array = NDArray[np.float64]
 _BLOCKS = 400  # at most; longer records are averaged further
 _LAGS = 48  # at most
 _PER_WINDOW = 8  # windows used per window length; more add nothing
-_FEWEST = 10
+_FEWEST = 12
 _CLAIM = 0.05
+_LEVERAGE = 0.35  # share of the driver's variance in one block, above which the record hangs on that block
 
 
 class _Frame(NamedTuple):
@@ -109,7 +111,7 @@ def correlate(
         series = np.stack([product[names[v]].values[a] for a, v in places], axis=1)[frame.windows] if frame else np.empty((0, len(places)))
         for d, driver in enumerate(found):
             beside = [product[name].values for name in others]
-            for place, entry in zip(places, _fit(frame, series, driver, beside, lags * step, level), strict=True):
+            for place, entry in zip(places, _fit(frame, series, driver, beside, lags.astype(np.float64) * step, level), strict=True):
                 entries[(*place, d)] = entry
     _adjust(entries)
     for (a, v, d), entry in entries.items():
@@ -200,10 +202,13 @@ def _fit(frame: _Frame | None, series: Array, driver: Driver, beside: list[Array
     beside = [np.asarray(frame.average @ np.nan_to_num(row[frame.windows])) for row in beside if np.isfinite(row[frame.windows]).all()]
     more = np.concatenate([timed, *(_unit(row)[:, None] for row in beside if np.ptp(row) > 0)], axis=1)
     nuisance = frame.offsets if "no_reversal" in limits else timed
+    if _heaviest(x[:, 0], nuisance) > _LEVERAGE:
+        return [_empty(limits | {"one_moment"}, windows=frame.windows.size) for _ in range(series.shape[1])]
     scale = np.maximum(np.std(y, axis=0), 1e-300)
     reach = np.maximum(np.std(x, axis=0), 1e-300)
     fit, units = fit_lags(frame.family, frame.prior, nuisance, (y - y.mean(axis=0)) / scale, (x - x.mean(axis=0)) / reach)
     p = p_values(fit)
+    plain = 2.0 * stdtr(fit.freedom, -np.abs(fit.slope[0] / fit.stderr[0]))
     noise = np.random.default_rng(20).normal(size=(y.shape[0], 400))
     entries = []
     for s in range(y.shape[1]):
@@ -231,6 +236,8 @@ def _fit(frame: _Frame | None, series: Array, driver: Driver, beside: list[Array
             "windows": frame.windows.size,
             "effective": _effective(y[:, s], x[:, best], nuisance, error),
         }
+        if "no_reversal" in limits:
+            entry["p_white"] = float(plain[s].min() * factor)
         entry |= _ramps(frame, law, nuisance, y[:, [s]], column, x[:, 0] if best == 0 else x[:, best])
         if more.shape[1] > timed.shape[1] and more.shape[1] < y.shape[0] - 3:
             again, _ = fit_lags(frame.family, frame.prior, more, y[:, [s]] / scale[s], column / reach[best])
@@ -243,6 +250,13 @@ def _empty(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
     names = ("lag", "slope", "stderr", "low", "high", "p_value", "p_search", "correlation", "partial_time", "partial_channels")
     empty = dict.fromkeys((*names, "effective", "rising", "rising_stderr", "falling", "falling_stderr"), np.nan)
     return {**empty, "limits": limits, "windows": windows}
+
+
+def _heaviest(x: Array, given: Array) -> float:
+    """Largest share of one block in the variance of the driver."""
+    q, _ = np.linalg.qr(given)
+    left = (x - q @ (q.T @ x)) ** 2
+    return float(left.max() / max(float(left.sum()), 1e-300))
 
 
 def _unit(row: Array) -> Array:
@@ -295,6 +309,8 @@ def _adjust(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:
         entry.setdefault("p_adjusted", np.nan)
         if entry["limits"] & {"constant", "too_few", "clusters"} or not np.isfinite(entry["p_search"]):
             verdict = "cannot_tell"
+        elif entry["p_adjusted"] >= _CLAIM and entry.get("p_white", 1.0) * len(tested) < _CLAIM:
+            verdict = "not_told_apart"
         elif entry["p_adjusted"] >= _CLAIM:
             verdict = "none_seen"
         else:

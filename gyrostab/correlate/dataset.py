@@ -11,7 +11,7 @@ from gyrostab.correlate.drivers import Driver, slope_units
 from gyrostab.correlate.judge import LIMITS, VERDICTS
 from gyrostab.noise import TERMS
 
-__all__ = ["assemble"]
+__all__ = ["assemble", "join"]
 
 # variable -> (key of the entry, long name, units)
 _NUMBERS = {
@@ -47,7 +47,7 @@ def assemble(
         return out
 
     kept = [*names, *(["observable"] if set(names) & set(TERMS) else [])]
-    result = product[kept].drop_attrs(deep=False)
+    result = product[kept].drop_attrs(deep=False).assign_coords(time_bounds=product["time_bounds"])
     for driver in found:
         what = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
         known = product[driver.name] if driver.name in product.data_vars else ("time", driver.values[0], what)
@@ -91,3 +91,11 @@ def _said(key: str, level: float) -> str:
     }
     text = {**ends, **ramps}.get(key)
     return f", {text}" if text else ""
+
+
+def join(product: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
+    """The product with the correlation beside it, for one file; what both hold is the product's."""
+    new = [name for name in result.data_vars if name not in product.variables]
+    return product.merge(result[new], compat="no_conflicts").assign_attrs(
+        interval_level=result.attrs["interval_level"], longest_lag_s=result.attrs["longest_lag_s"]
+    )

@@ -88,7 +88,7 @@ def _nanoseconds(stamps: Any) -> NDArray[np.int64]:
 
 def _grid(product: xr.Dataset, step: float) -> NDArray[np.int64]:
     time = _nanoseconds(product["time"].values)
-    return np.rint((time - time[0]) / 1e9 / step).astype(np.int64)
+    return np.asarray(np.rint((time - time[0]) / 1e9 / step), dtype=np.int64)
 
 
 def _lagged(whole: Array, before: int, place: NDArray[np.int64], lags: NDArray[np.int64]) -> Array:

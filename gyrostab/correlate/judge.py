@@ -19,11 +19,12 @@ LIMITS = {
     "constant": "{driver} is constant",
     "too_few": "there are too few independent windows",
     "clusters": "{driver} only differs between stretches that a gap parts",
-    "no_reversal": "{driver} never turns, so a drift in time looks the same",
+    "one_moment": "{driver} changes at one moment only",
+    "no_reversal": "{driver} never turns, so a drift or slow noise looks the same",
     "no_plateau": "{driver} never rests, so a lasting effect and one of its rate of change look alike",
     "other_channel": "another channel explains it as well",
 }
-_FEWEST = 10
+_FEWEST = 12
 _QUANTUM = {"degree_Celsius": 0.02}  # a smaller range of the channel counts as none
 
 
@@ -54,7 +55,7 @@ def statement(entry: dict[str, Any], driver: str, series: str) -> str:
     reasons = [LIMITS[name].format(driver=driver) for name in LIMITS if name in entry["limits"]]
     verdict = VERDICTS[entry["verdict"]]
     if verdict == "cannot_tell":
-        hard = [LIMITS[name].format(driver=driver) for name in ("constant", "too_few", "clusters") if name in entry["limits"]]
+        hard = [LIMITS[name].format(driver=driver) for name in ("constant", "too_few", "clusters", "one_moment") if name in entry["limits"]]
         return f"The record cannot tell whether {series} follows {driver}: {'; '.join(hard) or 'no window holds both'}."
     number = f"{entry['slope']:.3g} ({entry['low']:.3g} to {entry['high']:.3g}) {entry['units']}"
     chance = f"p = {max(entry['p_adjusted'], 1e-99):.2g} for the whole search"

@@ -10,7 +10,7 @@ from scipy.linalg import cho_factor, solve_triangular
 from scipy.sparse import csr_array
 from scipy.special import stdtr, stdtrit
 
-__all__ = ["LagFit", "averages", "fit_lags", "noise_family", "search_factor", "slope_interval", "whiten", "p_values", "weights"]
+__all__ = ["LagFit", "averages", "fit_lags", "noise_family", "p_values", "search_factor", "slope_interval", "weights", "whiten"]
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,8 @@ Each format is one module with ``matches(path)``, ``scan(path, options)`` and ``
 point group ``gyrostab.readers``; another package adds a format by declaring such an entry point.
 """
 
+from gyrostab.read.channel import read_channel
 from gyrostab.read.files import read_log, readers, scan_file
 from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
 
-__all__ = ["ColumnSummary", "FileSummary", "ReadOptions", "read_log", "readers", "scan_file"]
+__all__ = ["ColumnSummary", "FileSummary", "ReadOptions", "read_channel", "read_log", "readers", "scan_file"]

@@ -1,0 +1,134 @@
+"""Coefficients and window means against a channel."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.correlate.judge import VERDICTS
+from gyrostab.errors import SchemaError
+from gyrostab.noise import LAWS
+from gyrostab.plot.style import COLOURS, axis_names, new_figure, unit_label
+from gyrostab.schema import OBSERVABLE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_correlation"]
+
+_UP, _DOWN = COLOURS[1], COLOURS[0]
+_MOST = 3000
+
+
+def plot_correlation(result: xr.Dataset, *, axis: str | None = None, driver: str | None = None) -> Figure:
+    """Draw every variable against the channel at its lag, one row a variable and one column an axis.
+
+    Filled triangles up are windows in which the channel rises, open triangles down those in which it falls; the line is the
+    sensitivity, the band its interval about the middle of the data.
+
+    Parameters
+    ----------
+    result : xarray.Dataset
+        Of `gyrostab.correlate`.
+    axis : str, optional
+        Draw this axis only.
+    driver : str, optional
+        Channel or its rate of change; the channel by default.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    SchemaError, OptionError
+        When it is no correlation, or has no such axis.
+    """
+    if "coupling_verdict" not in result:
+        raise SchemaError("this dataset holds no correlation; call gyrostab.correlate (or 'gyrostab correlate') first")
+    names = axis_names(result, axis)
+    driver = str(result["driver"].values[0]) if driver is None else driver
+    if driver not in result["driver"].values:
+        raise SchemaError(f"the correlation has no driver {driver!r}; it has {', '.join(map(str, result['driver'].values))}")
+    variables = [str(name) for name in result["variable"].values]
+    figure = new_figure(1.0 + 3.4 * len(names), 1.2 + 2.5 * len(variables))
+    panels = figure.subplots(len(variables), len(names), sharex="col", squeeze=False)
+    for row, variable in zip(panels, variables, strict=True):
+        for panel, name in zip(row, names, strict=True):
+            _draw(panel, result.sel(axis=name), variable, driver)
+            panel.grid(alpha=0.3)
+        units = f"[{LAWS[variable].label}]" if variable in LAWS else unit_label(result[variable].attrs.get("units"))
+        row[0].set_ylabel(f"{variable.replace('_', ' ')} {units}".strip())
+    label = f"{driver.replace('_', ' ')} {unit_label(result[driver].attrs.get('units'))}".strip()
+    for panel, name in zip(panels[0], names, strict=True):
+        panel.annotate(f"axis {name}", (0.5, 1.0), (0, 22), "axes fraction", "offset points", ha="center", fontweight="bold")
+    for panel in panels[-1]:
+        panel.set_xlabel(label)
+    figure.legend(
+        handles=_key(driver, float(result.attrs.get("interval_level", 0.95))),
+        loc="outside lower center",
+        ncols=3,
+        fontsize="small",
+        frameon=False,
+    )
+    return figure
+
+
+def _draw(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
+    cell = part.sel(variable=variable, driver=driver)
+    lag = float(np.nan_to_num(cell["coupling_lag"]))
+    x, rising = _shifted(part[driver], lag)
+    y = part[variable].values
+    good = np.isfinite(x) & np.isfinite(y)
+    if variable in LAWS and "observable" in part:
+        good &= part["observable"].sel(term=variable).values == OBSERVABLE.index("observed")
+    every = max(1, int(good.sum()) // _MOST)
+    styles: list[tuple[Any, dict[str, Any]]] = [
+        (rising, {"marker": "^", "color": _UP}),
+        (~rising, {"marker": "v", "color": _DOWN, "markerfacecolor": "none"}),
+    ]
+    for part_of, style in styles:
+        chosen = np.flatnonzero(good & part_of)[::every]
+        panel.plot(x[chosen], y[chosen], linestyle="none", markersize=3.5, alpha=0.75, markeredgewidth=0.7, **style)
+    verdict = VERDICTS[int(cell["coupling_verdict"])].replace("_", " ")
+    p = float(cell["p_value_adjusted"])
+    late = f", {lag:.3g} s late" if lag else ""
+    panel.set_title(f"{verdict}{late}" + (f", p = {p:.2g}" if np.isfinite(p) else ""), fontsize="small")
+    slope, low, high = (float(part[f"{variable}_per_{driver}{end}"]) for end in ("", "_low", "_high"))
+    if not good.any() or not np.isfinite(slope):
+        return
+    ends = np.linspace(x[good].min(), x[good].max(), 50)
+    middle, level = float(np.mean(x[good])), float(np.mean(y[good]))
+    span = np.ptp(y[good]) or 1.0
+    panel.plot(ends, level + slope * (ends - middle), color="black", linewidth=1.2)
+    edges = [level + value * (ends - middle) for value in (low, high)]
+    panel.fill_between(ends, np.minimum(*edges), np.maximum(*edges), color="#8c8c8c", alpha=0.3, linewidth=0)
+    panel.set_ylim(y[good].min() - 0.1 * span, y[good].max() + 0.1 * span)
+
+
+def _shifted(driver: xr.DataArray, lag: float) -> tuple[Any, Any]:
+    """The driver one lag earlier at every window, and whether it rises there; NaN before the record and in holes."""
+    seconds = (driver["time"].values - driver["time"].values[0]) / np.timedelta64(1, "s")
+    values = driver.values.astype(np.float64)
+    known = np.isfinite(values)
+    if known.sum() < 3:
+        return np.full(values.size, np.nan), np.zeros(values.size, bool)
+    at = seconds - lag
+    moved = np.interp(at, seconds[known], values[known], left=np.nan, right=np.nan)
+    slope = np.interp(at, seconds[known], np.gradient(values[known], seconds[known]))
+    return moved, slope > 0
+
+
+def _key(driver: str, level: float) -> list[Any]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    what = driver.replace("_", " ")
+    return [
+        Line2D([], [], linestyle="none", marker="^", color=_UP, label=f"{what} rises"),
+        Line2D([], [], linestyle="none", marker="v", color=_DOWN, markerfacecolor="none", label=f"{what} falls"),
+        Patch(facecolor="#8c8c8c", alpha=0.3, edgecolor="black", label=f"sensitivity, {level:.0%} interval"),
+    ]
