@@ -1,0 +1,89 @@
+"""pipelines/archive.py takes files of several days to one product, as it is shipped."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import gyrostab
+from tests.conftest import ROOT
+
+HERTZ = 0.2
+N_TRUE = {"x": 0.01, "y": 0.03}  # deg/sqrt(h)
+DAYS = ("2026-03-01", "2026-03-02", "2026-03-03")
+
+
+def write_day(folder: Path, number: int, day: str, *, hours: float = 20.0) -> None:
+    """One file: white noise of `N_TRUE` for twenty hours, then four hours of nothing."""
+    rng = np.random.default_rng(number)
+    samples = int(hours * 3600 * HERTZ)
+    stamps = pd.date_range(day, periods=samples, freq=pd.Timedelta(seconds=1 / HERTZ))
+    columns = {"time": stamps.strftime("%Y-%m-%dT%H:%M:%S")}
+    for axis, n in N_TRUE.items():
+        columns[f"gyro_{axis} [deg/h]"] = np.round(10.0 + rng.normal(0.0, n * np.sqrt(3600.0 * HERTZ), samples), 4)
+    columns["temperature [degC]"] = np.round(60.0 + 5.0 * np.sin(np.arange(samples) / 5000.0), 2)
+    # the names run against the order of time
+    pd.DataFrame(columns).to_csv(folder / f"run_{9 - number}.csv", index=False)
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory) -> tuple[Path, str]:
+    """The pipeline as a user copies it: two files beside a folder of logs."""
+    folder = tmp_path_factory.mktemp("archive")
+    (folder / "logs").mkdir()
+    for number, day in enumerate(DAYS):
+        write_day(folder / "logs", number, day)
+    for name in ("archive.py", "archive.toml"):
+        shutil.copy(ROOT / "pipelines" / name, folder)
+    done = subprocess.run([sys.executable, "archive.py"], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+def test_it_is_short():
+    for name in ("archive.py", "archive.toml"):
+        assert len((ROOT / "pipelines" / name).read_text().splitlines()) <= 80
+
+
+def test_product_spans_the_days_and_finds_the_noise(archive):
+    folder, said = archive
+    with gyrostab.open_product(folder / "results" / "product.nc") as product:
+        bounds = product["time_bounds"].values
+        assert bounds[0, 0] == np.datetime64(DAYS[0])
+        assert bounds[-1, 1] > np.datetime64(DAYS[-1]) + np.timedelta64(19, "h")
+        for axis, n in N_TRUE.items():
+            part = product.sel(axis=axis).load()
+            seen = part["N"].where(part["observable"].sel(term="N") == 2)
+            assert float(seen.median()) == pytest.approx(n, rel=0.03)
+            assert f"axis {axis}: " in said
+        night = product.sel(time=slice(f"{DAYS[0]}T21:05", f"{DAYS[0]}T22:55"))  # windows wholly in the gap
+        assert night.sizes["time"] > 3
+        assert np.isnan(night["avar"]).all()
+        assert (night["window_coverage"] == 0).all()
+        assert (night["observable"] == 0).all()
+
+
+def test_everything_else_is_there(archive):
+    folder, said = archive
+    results = folder / "results"
+    assert {path.name for path in results.iterdir()} == {"log.nc", "product.nc", "report.html", "figures", "imu.yaml"}
+    assert {path.name for path in (results / "figures").iterdir()} >= {"coefficients.png", "davar.png", "adev_x.png", "davar_3d_y.png"}
+    assert "3 files" in (results / "report.html").read_text()
+    assert all(f"run_{9 - number}.csv" in said for number in range(3))
+    with gyrostab.open_log(results / "log.nc") as log:
+        assert gyrostab.gap_table(log)["samples"].tolist() == [4 * 3600 * HERTZ] * 2
+
+
+def test_no_logs_is_said_plainly(tmp_path):
+    for name in ("archive.py", "archive.toml"):
+        shutil.copy(ROOT / "pipelines" / name, tmp_path)
+    done = subprocess.run([sys.executable, "archive.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "holds no file *.csv" in done.stderr
+    assert "Traceback" not in done.stderr
