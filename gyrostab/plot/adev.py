@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import COLOURS, align_ylabels, axis_names, axis_style, new_figure
+from gyrostab.plot.style import COLOURS, axis_names, axis_style, new_figure, stack_panels
 from gyrostab.schema import OBSERVABLE, check_surface
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     (name,) = axis_names(product, axis)
     window = product.sel(axis=name).isel(time=_window(product.sel(axis=name), when)).compute()
     tau = window["tau"].values
-    figure = new_figure(8.0, 5.8)
+    figure = new_figure(8.0, 5.8, stacked=True)
     panel = figure.subplots()
     colour = axis_style(product, name)["color"]
     low, high = band(window["avar"].values, window["edf"].values)
@@ -69,7 +69,7 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     panel.set_xlabel("averaging time τ [s]")
     panel.set_ylabel("Allan deviation σ(τ) [deg/h]")
     panel.grid(which="both", alpha=0.25)
-    align_ylabels([panel])
+    stack_panels([panel])
     panel.legend(fontsize="small")
     stamp = str(np.datetime_as_string(window["time"].values, unit="s")).replace("T", " ")
     figure.suptitle(f"Allan deviation of axis {name}, window centred on {stamp} UTC")

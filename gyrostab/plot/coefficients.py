@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
     GREY,
-    align_ylabels,
     axis_names,
     axis_style,
     new_figure,
     require_coefficients,
     shade_spans,
+    stack_panels,
     time_axis,
     window_text,
 )
@@ -54,7 +54,7 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
     """
     require_coefficients(product)
     names = axis_names(product, axis)
-    figure = new_figure(10.0, 10.5)
+    figure = new_figure(10.0, 10.5, stacked=True)
     panels = figure.subplots(len(LAWS), 1, sharex=True)
     time = product["time"].values
     edges = _edges(time)
@@ -69,11 +69,11 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
         panel.set_ylabel(f"{symbol} [{law.label}]")
         panel.set_title(law.name, loc="left", fontsize="medium", pad=3, y=1.0)
         panel.grid(alpha=0.3)
-    figure.legend(handles=_key(product, names), loc="outside lower center", ncols=len(names) + 3, fontsize="small", frameon=False)
+    figure.legend(handles=_key(product, names), loc="lower center", ncols=len(names) + 3, fontsize="small", frameon=False)
     whose = f" of axis {names[0]}" if len(names) == 1 else ""
     figure.suptitle(", ".join(filter(None, [f"Noise coefficients{whose} over time", window_text(product)])))
     time_axis(panels[-1], edges)
-    align_ylabels(panels)
+    stack_panels(panels, between=0.32, below=0.3)
     return figure
 
 

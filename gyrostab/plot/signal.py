@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.plot.style import align_ylabels, axis_names, axis_style, new_figure, shade_spans, time_axis, unit_label
+from gyrostab.plot.style import axis_names, axis_style, new_figure, shade_spans, stack_panels, time_axis, unit_label
 from gyrostab.schema import log_channels, signal_name
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[
     shown = known if channels is None else list(channels)
     if missing := [channel for channel in shown if channel not in known]:
         raise OptionError(f"channel {', '.join(missing)} is not in the log; it has {', '.join(known) or 'none'}")
-    figure = new_figure(10.0, 1.2 + 1.7 * len(axes) + 1.4 * len(shown))
+    figure = new_figure(10.0, 1.2 + 1.7 * len(axes) + 1.4 * len(shown), stacked=True)
     ratios = [1.2] * len(axes) + [1.0] * len(shown)
     panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
     for panel, axis_name in zip(panels, axes, strict=False):
@@ -74,7 +74,7 @@ def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[
     rate = log.attrs.get("sampling_rate_hz")
     figure.suptitle(f"{what} as recorded" + (f", {float(rate):g} samples a second" if rate else ""))
     time_axis(panels[-1], log["time"][[0, -1]].values)
-    align_ylabels(panels)
+    stack_panels(panels)
     return figure
 
 

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.plot.style import align_ylabels, axis_names, new_figure, time_axis, window_text
+from gyrostab.plot.style import axis_names, new_figure, stack_panels, time_axis, window_text
 from gyrostab.schema import ESTIMATORS, check_surface
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
     from matplotlib.patches import Patch
 
     names = axis_names(product, axis)
-    figure = new_figure(10.0, 1.3 + 2.7 * len(names))
+    figure = new_figure(10.0, 1.3 + 2.7 * len(names), stacked=True)
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     time, tau = product["time"].values, product["tau"].values
     cells, merged = _columns(product, names, columns)
@@ -71,14 +71,13 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
         panel.set_yscale("log", subs=(2, 5))
         panel.set_ylabel(f"axis {name}\naveraging time τ [s]")
     label = "σ(τ) / its median over time" if relative else "Allan deviation σ(τ) [deg/h]"
-    _colour_bar(figure, mesh, list(panels), label, relative=relative)
     handles: list[Any] = []
     if any(not (deviation > 0).all() for deviation, _ in cells):
         handles.append(Patch(facecolor="#d0d0d0", edgecolor="#909090", hatch="////", label="no estimate (gap, or too few terms)"))
     if any(weighted.any() for _, weighted in cells):
         handles.append(_dot_key())
     if handles:
-        figure.legend(handles=handles, loc="outside lower left", ncols=2, fontsize="small", frameon=False)
+        figure.legend(handles=handles, loc="lower left", ncols=2, fontsize="small", frameon=False)
     text = ", ".join(
         filter(
             None,
@@ -91,7 +90,8 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
     )
     figure.suptitle(text)
     time_axis(panels[-1], time_edges)
-    align_ylabels(panels)
+    stack_panels(panels, below=0.3 if handles else 0.0, right=1.3)
+    _colour_bar(figure, mesh, label, relative=relative)
     return figure
 
 
@@ -180,8 +180,11 @@ def _limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float, float
     return (float(low), float(high if high > low else 1.001 * low))
 
 
-def _colour_bar(figure: Figure, mesh: Any, panels: list[Axes], label: str, *, relative: bool) -> None:
-    bar = figure.colorbar(mesh, ax=panels, label=label, extend="both", pad=0.01)
+def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> None:
+    """Draw the colour bar into the room that the panels leave on the right."""
+    room = figure.subplotpars
+    place = figure.add_axes((room.right + 0.012, room.bottom, 0.025, room.top - room.bottom))
+    bar = figure.colorbar(mesh, cax=place, label=label, extend="both")
     if relative:
         low, high = mesh.get_clim()
         ticks = [tick for tick in (0.1, 0.2, 0.33, 0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0) if low <= tick <= high]
