@@ -17,7 +17,8 @@ from PIL import Image
 from gyrostab.cli import main
 from gyrostab.errors import OutputError, SchemaError
 from gyrostab.export import to_netcdf
-from gyrostab.plot import plot_davar, plot_signal
+from gyrostab.noise import LAWS
+from gyrostab.plot import plot_coefficients, plot_davar, plot_signal
 from gyrostab.plot.figures import product_figures, save_figures
 from gyrostab.plot.style import save_png
 from tests import synthetic
@@ -88,6 +89,23 @@ def test_no_cell_without_estimate_no_word_of_it():
     ]
     gap = product.isel(time=slice(0, 23))  # the gap without the weighted stretch
     assert [text.get_text() for text in plot_davar(gap).legends[0].get_texts()] == ["no estimate (gap, or too few terms)"]
+
+
+@pytest.mark.parametrize("spread", [1.0, 20.0, 1e4])
+def test_labels_stand_clear_of_the_ticks_and_every_panel_has_some(spread):
+    product = synthetic.product(axes="x")
+    for symbol in LAWS:  # linear scale, a log scale of little more than a decade, one of many
+        product[symbol] = product[symbol] * np.geomspace(1.0, spread, product.sizes["time"])
+    for figure in (plot_coefficients(product), plot_davar(product), plot_davar(product.isel(tau=slice(4, 7)))):
+        renderer = figure.canvas.get_renderer()
+        for panel in figure.axes:
+            if panel.get_label() == "<colorbar>":
+                continue
+            ticks = [label.get_window_extent(renderer) for label in panel.get_yticklabels(which="both") if label.get_text()]
+            label = panel.yaxis.label.get_window_extent(renderer)
+            assert len(ticks) >= 2
+            assert 0.0 <= label.x0
+            assert label.x1 < min(tick.x0 for tick in ticks)
 
 
 def test_all_figures_of_a_product(tmp_path, capsys):

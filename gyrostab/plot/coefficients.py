@@ -13,6 +13,7 @@ from gyrostab.plot.style import (
     GREY,
     axis_names,
     axis_style,
+    label_log_axis,
     new_figure,
     require_coefficients,
     shade_spans,
@@ -110,6 +111,7 @@ def _scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> N
     if numbers.size and numbers.max() > 10 * numbers.min():
         panel.set_yscale("log")
         panel.set_ylim(numbers.min() / 1.5, numbers.max() * 1.5)
+        label_log_axis(panel.yaxis, numbers.min(), numbers.max())
     elif numbers.size:
         panel.set_ylim(0.0, numbers.max() * 1.15)
     else:

@@ -15,6 +15,7 @@ from gyrostab.units import INNER
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "axis_names",
     "axis_style",
     "duration",
+    "label_log_axis",
     "new_figure",
     "save_png",
     "shade_spans",
@@ -131,12 +133,24 @@ def stack_panels(panels: Sequence[Axes] | NDArray[Any], *, between: float = 0.13
     average = (height - top - bottom - between * (len(panels) - 1)) / len(panels)
     figure.subplots_adjust(top=1 - top / height, bottom=bottom / height, right=1 - right / width, hspace=between / average)
     renderer = figure.canvas.get_renderer()
-    ticks = [label.get_window_extent(renderer).width for panel in panels for label in panel.get_yticklabels() if label.get_text()]
+    ticks = [
+        label.get_window_extent(renderer).width for panel in panels for label in panel.get_yticklabels(which="both") if label.get_text()
+    ]
     labels = [panel.yaxis.label.get_window_extent(renderer).width for panel in panels]
     inches = max(ticks, default=0.0) / figure.dpi + 0.14
     figure.subplots_adjust(left=(inches + max(labels) / figure.dpi + 0.08) / width)
     for panel in panels:
         panel.yaxis.set_label_coords(0.0, 0.5, transform=panel.transAxes + ScaledTranslation(-inches, 0.0, figure.dpi_scale_trans))
+
+
+def label_log_axis(axis: Axis, low: float, high: float) -> None:
+    """Label a logarithmic axis that shows `low` to `high`: powers of ten, or 1, 2, 5 where these would be too few."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_minor_formatter(NullFormatter())
+    if high < 100.0 * low:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
 
 
 def save_png(figure: Figure, target: str | os.PathLike[str] | IO[bytes], *, dpi: int = _DPI) -> None:

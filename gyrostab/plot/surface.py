@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.plot.style import axis_names, new_figure, stack_panels, time_axis, window_text
+from gyrostab.plot.style import axis_names, label_log_axis, new_figure, stack_panels, time_axis, window_text
 from gyrostab.schema import ESTIMATORS, check_surface
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
         mesh = panel.pcolormesh(time_edges, tau_edges, shown.T, norm=norm, cmap=CHANGE_CMAP if relative else CMAP, rasterized=True)
         _mark_weighted(panel, time_edges, tau, weighted)
         panel.set_yscale("log", subs=(2, 5))
+        label_log_axis(panel.yaxis, tau[0], tau[-1])
         panel.set_ylabel(f"axis {name}\naveraging time τ [s]")
     label = "σ(τ) / its median over time" if relative else "Allan deviation σ(τ) [deg/h]"
     handles: list[Any] = []
