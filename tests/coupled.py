@@ -56,7 +56,7 @@ def product(
     gap: bool = True,
     terms: bool = True,
 ) -> xr.Dataset:
-    """A product whose x axis follows temperature by `slope` [deg/h/K] and its rate by `pace`, `lag` steps late; the others follow nothing."""
+    """A product whose x axis follows temperature by `slope` [deg/h/K] and its rate by `pace`, `lag` steps late; others follow nothing."""
     rng = np.random.default_rng(seed)
     head = 40
     cells = windows + 1

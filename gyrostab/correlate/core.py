@@ -287,9 +287,8 @@ def _ramps(frame: _Frame, law: int, nuisance: Array, y: Array, x: Array, course:
     for name, part in (("rising", up), ("falling", ~up)):
         keep = np.flatnonzero(part)
         out[name] = out[f"{name}_stderr"] = np.nan
-        columns = nuisance[keep]
-        columns = columns[:, np.ptp(columns, axis=0) > 0] if keep.size else columns
-        columns = np.concatenate([np.ones((keep.size, 1)), columns[:, : max(0, columns.shape[1] - (columns.shape[1] > 1))]], axis=1)
+        columns = nuisance[keep][:, 1:]  # the offsets of all stretches add up to the constant
+        columns = np.concatenate([np.ones((keep.size, 1)), columns[:, np.ptp(columns, axis=0) > 0] if keep.size else columns], axis=1)
         if keep.size < _FEWEST // 2 + columns.shape[1] or np.ptp(x[keep]) < 0.1 * np.ptp(x):
             continue
         if np.linalg.matrix_rank(np.concatenate([columns, _unit(x[keep, 0])[:, None]], axis=1)) <= columns.shape[1]:

@@ -69,7 +69,8 @@ def drivers(product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.i
 
 def other_channels(product: xr.Dataset, driver: str) -> list[str]:
     """Channels of the product beside the driver and what is derived from it."""
-    return [name for name in _channels(product) if name not in (driver, f"{driver}_rate") and f"{name}_rate" != driver]
+    bare = driver.removesuffix("_of_file")
+    return [name for name in _channels(product) if name not in (driver, bare, f"{bare}_rate")]
 
 
 def _channels(product: xr.Dataset) -> list[str]:

@@ -130,8 +130,14 @@ def weights(fit: LagFit) -> Array:
 
 
 def p_values(fit: LagFit) -> Array:
-    """Two-sided p-values of the slopes by (series, lag), averaged over the noise laws by their weights."""
-    return np.asarray((weights(fit) * 2.0 * stdtr(fit.freedom, -np.abs(fit.slope / fit.stderr))).sum(axis=0))
+    """Two-sided p-values of the slopes by (series, lag), averaged over the noise laws by their weights without the driver.
+
+    Weights with the driver would favour, in a search, the laws under which the chosen lag does best.
+    """
+    t = fit.slope / fit.stderr
+    raw = fit.log_weight - 0.5 * fit.freedom * np.log1p(t**2 / fit.freedom)
+    weight = np.exp(raw - raw.max(axis=0))
+    return np.asarray((weight * 2.0 * stdtr(fit.freedom, -np.abs(t))).sum(axis=0) / weight.sum(axis=0))
 
 
 def slope_interval(fit: LagFit, series: int, lag: int, level: float) -> tuple[float, float, float, float]:

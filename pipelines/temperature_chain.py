@@ -1,0 +1,30 @@
+"""Take a product and the temperature that another team measured, and write what follows it as NetCDF with a figure."""
+
+import sys
+import tomllib
+from pathlib import Path
+
+import gyrostab
+
+
+def chain(plan, folder):
+    """Correlate one product with one channel of another file, as the plan says; paths start at the plan's folder."""
+    product = gyrostab.open_product(folder / plan["product"])
+    channel = gyrostab.read_channel(folder / plan["channel"]["file"], plan["channel"]["name"], **plan["channel"].get("read", {}))
+    found = gyrostab.correlate(product, channel=channel, **plan["correlate"])
+    gyrostab.to_netcdf(found, folder / plan["output"], overwrite=True)
+    gyrostab.plot_correlation(found).savefig(folder / plan["figure"], dpi=150)
+    return found
+
+
+def sentences(found):
+    """List what is said of every axis, variable and driver that is coupled, or may be."""
+    meanings = found["coupling_verdict"].attrs["flag_meanings"].split()
+    said = found["statement"].where(found["coupling_verdict"] >= meanings.index("not_told_apart"), "")
+    return [str(sentence) for sentence in said.values.ravel() if sentence] or ["Nothing is seen to follow it."]
+
+
+if __name__ == "__main__":
+    plan_file = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).with_suffix(".toml"))
+    result = chain(tomllib.loads(plan_file.read_text(encoding="utf-8")), plan_file.parent)
+    print(*sentences(result), sep="\n")

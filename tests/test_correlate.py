@@ -1,0 +1,168 @@
+"""Coupling with a channel: what is there is found, what is not is not, and the intervals hold."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import cf_units
+import numpy as np
+import pytest
+import xarray as xr
+
+import gyrostab
+from gyrostab.cli import main
+from gyrostab.correlate.judge import VERDICTS
+from gyrostab.errors import OptionError, TimeError
+from gyrostab.kernels.coupling import averages, fit_lags, slope_interval
+from tests import coupled
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def verdict(found: xr.Dataset, **where: str) -> str:
+    return VERDICTS[int(found["coupling_verdict"].sel(**where))]
+
+
+def test_slope_and_lag_are_found_and_quiet_axes_are_not_accused():
+    found = gyrostab.correlate(coupled.product(slope=0.3, lag=4, noises="white"), max_lag="5min")
+    place = {"axis": "x", "variable": "window_mean", "driver": "temperature"}
+    assert verdict(found, **place) == "coupled"
+    assert abs(float(found["coupling_lag"].sel(place)) - 120) <= 60
+    assert float(found["window_mean_per_temperature_low"][0]) < 0.3 < float(found["window_mean_per_temperature_high"][0])
+    assert (found["coupling_verdict"].sel(axis=["y", "z"]) == VERDICTS.index("none_seen")).all()
+    assert "follows temperature" in str(found["statement"].sel(place).values)
+
+
+def test_rate_of_change_is_found():
+    found = gyrostab.correlate(coupled.product(pace=0.05, noises="white"), variables="window_mean", max_lag=0)
+    assert verdict(found, axis="x", variable="window_mean", driver="temperature_rate") == "coupled"
+    low, high = (float(found[f"window_mean_per_temperature_rate_{end}"][0]) for end in ("low", "high"))
+    assert low < 0.05 < high
+
+
+def test_ramps_are_fitted_apart():
+    found = gyrostab.correlate(coupled.product(slope=0.3, noises="white", windows=240), variables="window_mean", max_lag=0)
+    for way in ("rising", "falling"):
+        slope, error = (float(found[f"window_mean_per_temperature_{way}{end}"][0]) for end in ("", "_stderr"))
+        assert abs(slope - 0.3) < 4 * error < 0.2
+
+
+def test_white_law_is_ordinary_least_squares():
+    rng = np.random.default_rng(3)
+    y, x = rng.normal(size=(40, 1)), rng.normal(size=(40, 1))
+    fit, _ = fit_lags([np.eye(40)], np.zeros(1), np.ones((40, 1)), y, x)
+    design = np.concatenate([np.ones((40, 1)), x], axis=1)
+    solved, rest, *_ = np.linalg.lstsq(design, y, rcond=None)
+    assert fit.slope[0, 0, 0] == pytest.approx(solved[1, 0])
+    error = np.sqrt(rest[0] / 38 * np.linalg.inv(design.T @ design)[1, 1])
+    assert fit.stderr[0, 0, 0] == pytest.approx(error)
+    assert slope_interval(fit, 0, 0, 0.95)[3] == pytest.approx(solved[1, 0] + 2.024394 * error, rel=1e-5)
+
+
+def test_overlap_of_windows_is_counted():
+    """Against the variance of block means of windows that are cut from white noise."""
+    rng = np.random.default_rng(4)
+    cells = rng.normal(size=(20000, 14))
+    windows = 0.5 * (cells[:, 1:] + cells[:, :-1])[:, :12]
+    mean, _, white = averages(np.repeat(np.arange(3), 4), np.arange(12) * 30.0, 60.0, np.ones(12))
+    blocks = windows @ mean.toarray().T
+    np.testing.assert_allclose(np.cov(blocks.T) * 2, white, atol=0.02)  # a full window of two cells has variance 1/2
+
+
+@pytest.mark.parametrize(("noises", "heat"), [("flicker", "sine"), ("walk", "ramps"), ("slow", "walk")])
+def test_intervals_hold_and_nothing_is_invented(noises, heat):
+    hold, claims, records = [], 0, 12
+    for seed in range(records):
+        found = gyrostab.correlate(
+            coupled.product(seed=40_000 + seed, noises=noises, heat=heat, slope=0.5, windows=80, terms=False), max_lag=0
+        )
+        low, high = found["window_mean_per_temperature_low"].values, found["window_mean_per_temperature_high"].values
+        hold += list((low < [0.5, 0, 0]) & (high > [0.5, 0, 0]))
+        nothing = gyrostab.correlate(coupled.product(seed=50_000 + seed, noises=noises, heat=heat, windows=80))
+        claims += bool((nothing["coupling_verdict"] == VERDICTS.index("coupled")).any())
+    assert np.mean(hold) > 0.80  # 0.95 less four standard errors of 36 shares
+    assert claims <= 3  # of 12 at the rate of 5 %: more happens once in 500
+
+
+def test_a_record_that_cannot_tell_says_why():
+    flat = gyrostab.correlate(coupled.product(heat="flat"), variables="window_mean")
+    assert (flat["coupling_verdict"] == VERDICTS.index("cannot_tell")).all()
+    assert "temperature is constant" in str(flat["statement"].values[0, 0, 0])
+    few = gyrostab.correlate(coupled.product(windows=16), variables="window_mean")
+    assert "too few independent windows" in str(few["statement"].values[0, 0, 0])
+    rise = gyrostab.correlate(coupled.product(heat="rise", slope=1.0, noises="white"), variables="window_mean", max_lag=0)
+    assert verdict(rise, axis="x", variable="window_mean", driver="temperature") == "not_told_apart"
+    assert "never turns" in str(rise["statement"].values[0, 0, 0])
+
+
+def test_two_clusters_across_a_gap_are_no_slope():
+    product = coupled.product(windows=160, noises="white", gap=False)
+    late = np.arange(160) >= 80
+    rng = np.random.default_rng(5)
+    product["temperature"] = product["temperature"].copy(data=26 + 6.0 * late + rng.normal(0, 0.05, 160))
+    product["window_mean"] = product["window_mean"] + 30.0 * late
+    product["window_mean"][:, 50:110] = np.nan
+    found = gyrostab.correlate(product, variables="window_mean", max_lag=0)
+    assert set(found["coupling_verdict"].sel(driver="temperature").values.ravel()) == {VERDICTS.index("cannot_tell")}
+    assert "a gap parts" in str(found["statement"].values[0, 0, 0])
+
+
+def test_channel_of_a_file_is_averaged_and_never_extrapolated(tmp_path):
+    product = coupled.product(slope=0.3, noises="white", gap=False)
+    stamps = product["time_bounds"].values[0, 0] + (np.arange(2400) * 1_000_000_000).astype("timedelta64[ns]")
+    seconds = np.arange(2400.0)
+    probe = xr.DataArray(20 + 5 * np.sin(seconds / 300), dims="t", coords={"t": stamps}, name="probe", attrs={"units": "degree_Celsius"})
+    found = gyrostab.correlate(product, channel=probe, variables="window_mean", max_lag=0)
+    np.testing.assert_allclose(found["probe"][3], probe[90:150].mean())
+    assert np.isnan(found["probe"].values[80:]).all()
+    with pytest.raises(TimeError, match="do not overlap"):
+        gyrostab.correlate(product, channel=probe.assign_coords(t=stamps - np.timedelta64(9, "D")))
+
+
+def test_errors_say_what_to_do():
+    product = coupled.product()
+    with pytest.raises(OptionError, match="no channel 'vibration'; it has temperature"):
+        gyrostab.correlate(product, channel="vibration")
+    with pytest.raises(OptionError, match="longer than the record"):
+        gyrostab.correlate(product, max_lag="3D")
+    with pytest.raises(OptionError, match="variable 'avar'"):
+        gyrostab.correlate(product, variables="avar")
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory) -> Path:
+    return gyrostab.to_netcdf(coupled.product(slope=0.3, noises="white"), tmp_path_factory.mktemp("coupled") / "product.nc")
+
+
+def test_command_writes_legal_units_and_a_figure(stored, tmp_path, capsys):
+    target = tmp_path / "out.nc"
+    assert main(["correlate", str(stored), "--with", "temperature", "--max-lag", "5min", "-o", str(target)]) == 0
+    printed = capsys.readouterr().out
+    assert "Window mean of axis x follows temperature" in printed
+    assert target.with_suffix(".png").stat().st_size > 10_000
+    with gyrostab.open_product(target) as found:
+        units = found["window_mean_per_temperature"].attrs["units"]
+        assert cf_units.Unit(units) == cf_units.Unit("degree hour-1") / cf_units.Unit("K")
+    checker = Path(sys.executable).with_name("compliance-checker")
+    offline = {**os.environ, "http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+    done = subprocess.run([checker, "-t", "cf:1.11", "-c", "strict", target], capture_output=True, text=True, check=False, env=offline)
+    assert "All tests passed!" in done.stdout, done.stdout
+
+
+def test_pipeline_joins_another_teams_file(stored, tmp_path):
+    plan = tomllib.loads((ROOT / "pipelines" / "temperature_chain.toml").read_text(encoding="utf-8"))
+    product = gyrostab.open_product(stored)
+    (tmp_path / plan["product"]).write_bytes(stored.read_bytes())
+    lines = [f"{t},{v:.4f}" for t, v in zip(product["time"].values, product["temperature"].values, strict=True)]
+    (tmp_path / plan["channel"]["file"]).write_text("\n".join(["time,T_probe", *lines]), encoding="utf-8")
+    (tmp_path / "plan.toml").write_bytes((ROOT / "pipelines" / "temperature_chain.toml").read_bytes())
+    done = subprocess.run(
+        [sys.executable, ROOT / "pipelines" / "temperature_chain.py", tmp_path / "plan.toml"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Window mean of axis x follows temperature of file" in done.stdout
+    assert {"coupling.nc", "coupling.png"} <= {path.name for path in tmp_path.iterdir()}
