@@ -166,3 +166,30 @@ def test_pipeline_joins_another_teams_file(stored, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "Window mean of axis x follows temperature of file" in done.stdout
     assert {"coupling.nc", "coupling.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+WARM_UP = {"map": {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z", "Tx": "temperature"}}
+WARM_UP["unit"] = {"gyro": "deg/s", "time": "s", "temperature": "degC"}
+MPU = {"map": {"gx_dps": "gyro_x", "gy_dps": "gyro_y", "gz_dps": "gyro_z", "temp_C": "temperature"}}
+MPU["unit"] = {"gyro": "deg/s", "temperature": "degC"}
+ROCKET = {"temperature_celsius": "temperature [degC]"}
+ROCKET |= {f"raw_angular_rate_{axis}_deg_per_s": f"gyro_{axis} [deg/s]" for axis in "xyz"}
+
+
+@pytest.mark.parametrize(
+    ("name", "read", "window", "step", "following", "quiet"),
+    [
+        ("fog-hybrid-warmup/run1_static.txt", WARM_UP, "2.5s", "0.5s", "y", "z"),
+        ("mpu6050-static-temperature/mpu6050_10min.csv.gz", MPU, "20s", "5s", "x", "z"),
+        ("rocket-flight-temperature/jackpot_launch_1.csv", {"map": ROCKET}, "5s", "1s", "", "xyz"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_real_recordings(recordings, name, read, window, step, following, quiet):
+    log = gyrostab.regularise(gyrostab.read_log(recordings(name), **read))
+    product = gyrostab.fit_noise(gyrostab.davar(log, window=window, step=step, taus=8))
+    found = gyrostab.correlate(product, variables="window_mean")["coupling_verdict"].sel(variable="window_mean")
+    for axis in following:
+        assert VERDICTS[int(found.sel(axis=axis, driver="temperature"))] in ("coupled", "not_told_apart")
+    for axis in quiet:
+        assert set(found.sel(axis=axis).values) <= {VERDICTS.index("cannot_tell"), VERDICTS.index("none_seen")}
