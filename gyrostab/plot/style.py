@@ -138,7 +138,7 @@ def stack_panels(panels: Sequence[Axes] | NDArray[Any], *, between: float = 0.13
     ]
     labels = [panel.yaxis.label.get_window_extent(renderer).width for panel in panels]
     inches = max(ticks, default=0.0) / figure.dpi + 0.14
-    figure.subplots_adjust(left=(inches + max(labels) / figure.dpi + 0.08) / width)
+    figure.subplots_adjust(left=(inches + max(labels) / figure.dpi + 0.1) / width)
     for panel in panels:
         panel.yaxis.set_label_coords(0.0, 0.5, transform=panel.transAxes + ScaledTranslation(-inches, 0.0, figure.dpi_scale_trans))
 
