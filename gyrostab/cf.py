@@ -40,7 +40,7 @@ _PACKING = ("dtype", "scale_factor", "add_offset")  # of integer counts, where t
 _JSON_NAMES = "json_attributes"
 
 # Names that UDUNITS reads as we mean them. A whole power may follow; a broken one is misread without a word, so it never passes.
-_NAMES = "degree_Celsius|degree|hour|microradian|radian|s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
+_NAMES = "degree_Celsius|standard_free_fall|degree|hour|microradian|radian|s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
 _SAFE_UNIT = re.compile(rf"(?:{_NAMES})(?:-?[1-9])?(?: (?:{_NAMES})(?:-?[1-9])?)*")
 
 

@@ -308,7 +308,7 @@ def plot(
     output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")],
     common: Common = Common(),
 ) -> None:
-    """Draw all the figures of a product as PNG: coefficients, dynamic Allan deviation as map and as surface, one window of each axis.
+    """Draw all the figures of a product as PNG: coefficients, also against temperature, dynamic Allan deviation as map and surface.
 
     Example: gyrostab plot product.nc -o figures
 

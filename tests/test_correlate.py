@@ -18,7 +18,7 @@ from gyrostab.cli import main
 from gyrostab.correlate.judge import VERDICTS
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.kernels.coupling import averages, fit_lags, slope_interval
-from tests import coupled
+from tests import coupled, synthetic
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -193,3 +193,14 @@ def test_real_recordings(recordings, name, read, window, step, following, quiet)
         assert VERDICTS[int(found.sel(axis=axis, driver="temperature"))] in ("coupled", "not_told_apart")
     for axis in quiet:
         assert set(found.sel(axis=axis).values) <= {VERDICTS.index("cannot_tell"), VERDICTS.index("none_seen")}
+
+
+def test_a_term_seen_in_scattered_windows_only_is_no_ground_for_a_verdict():
+    """Each window a stretch of its own leaves nothing to tell a slope from."""
+    product = synthetic.product()
+    found = gyrostab.correlate(product)
+    assert np.isfinite(found["p_value"].sel(variable="window_mean")).any()
+    seen = product["observable"].sel(axis="x", term="Q").values == 2
+    assert 12 < seen.sum() < 20
+    assert not (seen[1:] & seen[:-1]).any()  # enough windows, but none beside another
+    assert VERDICTS[int(found["coupling_verdict"].sel(axis="x", variable="Q").values[0])] == "cannot_tell"

@@ -202,6 +202,8 @@ def _fit(frame: _Frame | None, series: Array, driver: Driver, beside: list[Array
     beside = [np.asarray(frame.average @ np.nan_to_num(row[frame.windows])) for row in beside if np.isfinite(row[frame.windows]).all()]
     more = np.concatenate([timed, *(_unit(row)[:, None] for row in beside if np.ptp(row) > 0)], axis=1)
     nuisance = frame.offsets if "no_reversal" in limits else timed
+    if x.shape[0] - nuisance.shape[1] - 1 < _FEWEST // 2:  # nearly every block is a stretch of its own
+        return [_empty(limits | {"too_few"}, windows=frame.windows.size) for _ in range(series.shape[1])]
     if _heaviest(x[:, 0], nuisance) > _LEVERAGE:
         return [_empty(limits | {"one_moment"}, windows=frame.windows.size) for _ in range(series.shape[1])]
     scale = np.maximum(np.std(y, axis=0), 1e-300)

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 
 import xarray as xr
 
+from gyrostab.correlate import correlate
 from gyrostab.errors import OutputError
 from gyrostab.output import new_output
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
+from gyrostab.plot.correlation import plot_correlation
 from gyrostab.plot.style import save_png
 from gyrostab.plot.surface import plot_davar, plot_davar_3d
 from gyrostab.schema import check_product
@@ -35,7 +37,8 @@ def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
     Returns
     -------
     dict
-        ``coefficients``, ``davar``, ``davar_change``, and for each axis ``adev_<axis>`` and ``davar_3d_<axis>``; the surface in three
+        ``coefficients``, ``davar``, ``davar_change``, ``temperature`` where there is one, and for each axis
+        ``adev_<axis>`` and ``davar_3d_<axis>``; the surface in three
         dimensions only where there are two windows and two averaging times at least.
 
     Raises
@@ -49,6 +52,8 @@ def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
         "davar": lambda: plot_davar(product),
         "davar_change": lambda: plot_davar(product, relative=True),
     }
+    if "temperature" in product and product["temperature"].dims == ("time",):
+        figures["temperature"] = lambda: plot_correlation(product if "coupling_verdict" in product else correlate(product))
     for axis in map(str, product["axis"].values):
         figures[f"adev_{axis}"] = lambda axis=axis: plot_adev(product, axis)  # type: ignore[misc]
         if min(product.sizes["time"], product.sizes["tau"]) > 1:
