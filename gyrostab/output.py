@@ -6,6 +6,7 @@ import contextlib
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -98,11 +99,18 @@ def _sync(path: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
+    """Remove what was written; a thread that still writes its piece of a directory may bring it back, so look again."""
+    if not path.is_dir():
+        with contextlib.suppress(OSError):
             path.unlink()
+        return
+    gone = 0
+    for _ in range(100):
+        shutil.rmtree(path, ignore_errors=True)
+        gone = 0 if path.exists() else gone + 1
+        if gone == 5:
+            return
+        time.sleep(0.02)
 
 
 def damaged_input(error: Exception) -> str | None:

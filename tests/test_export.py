@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 import tracemalloc
 from pathlib import Path
 
@@ -367,6 +370,30 @@ def test_an_interruption_leaves_nothing_behind(tmp_path, error):
         with pytest.raises(error):
             write(surface, tmp_path / "out")
         assert not list(tmp_path.iterdir())
+
+
+def test_a_late_piece_of_a_directory_is_removed_too(tmp_path):
+    """A worker thread may write on for a moment after another one has failed."""
+
+    def write_on(folder):
+        for number in range(20):
+            with contextlib.suppress(FileNotFoundError):
+                folder.mkdir(exist_ok=True)
+                (folder / f"piece{number}").touch()
+            time.sleep(0.003)
+
+    def fail():
+        with new_output(tmp_path / "out.zarr", directory=True) as temporary:
+            worker = threading.Thread(target=write_on, args=(temporary,))
+            worker.start()
+            workers.append(worker)
+            raise ZeroDivisionError
+
+    workers: list[threading.Thread] = []
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    workers[0].join()
+    assert not list(tmp_path.iterdir())
 
 
 def test_output_has_the_usual_permissions(tmp_path):
