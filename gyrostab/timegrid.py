@@ -186,19 +186,21 @@ class TimeGridIndex(CoordinateTransformIndex):
         return pd.DatetimeIndex(self.transform.generate_coords()[self.transform.coord_names[0]], name=dim)
 
 
-def time_coordinate(start: int, rate: float, size: int, *, name: str = "time") -> xr.Coordinates:
+def time_coordinate(start: int, rate: float, size: int, *, name: str = "time", first: int = 0, stride: int = 1) -> xr.Coordinates:
     """Lazy, exact, uniform time coordinate.
 
     Parameters
     ----------
     start : int
-        Stamp of the first sample [ns since 1970-01-01T00:00:00].
+        Stamp of sample 0 [ns since 1970-01-01T00:00:00].
     rate : float
         Sampling rate [Hz], taken as the decimal number that it prints as.
     size : int
-        Number of samples.
+        Number of samples on the axis.
     name : str
         Name of the coordinate and of its dimension.
+    first, stride : int
+        The axis holds the samples `first`, ``first + stride``, ... of the grid that begins at `start`.
 
     Returns
     -------
@@ -214,4 +216,4 @@ def time_coordinate(start: int, rate: float, size: int, *, name: str = "time") -
     array(['1970-01-01T00:00:00.000000000', '1970-01-01T00:00:00.005000000'],
           dtype='datetime64[ns]')
     """
-    return xr.Coordinates.from_xindex(TimeGridIndex(_GridTransform(start, rate, size, name=name, dim=name)))
+    return xr.Coordinates.from_xindex(TimeGridIndex(_GridTransform(start, rate, size, first=first, stride=stride, name=name, dim=name)))

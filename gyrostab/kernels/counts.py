@@ -1,0 +1,58 @@
+"""Values that are whole multiples of one factor: to integer counts and back, bit for bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["from_counts", "to_counts"]
+
+
+def to_counts(values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill: int) -> NDArray[np.integer[Any]] | None:
+    """Integers of which ``from_counts`` makes the very same values; None when there are none.
+
+    Parameters
+    ----------
+    values : ndarray of float64
+        Values, NaN where missing.
+    scale : float
+        Factor.
+    dtype : dtype
+        Integer type of the counts.
+    fill : int
+        Stands for NaN.
+
+    Examples
+    --------
+    >>> to_counts(np.array([0.1, np.nan, 0.1 * 3]), 0.1, "i2", -32767)
+    array([     1, -32767,      3], dtype=int16)
+    >>> to_counts(np.array([0.1, 0.3]), 0.1, "i2", -32767) is None  # 3 * 0.1 is another double
+    True
+    """
+    limits = np.iinfo(dtype)
+    missing = np.isnan(values)
+    with np.errstate(over="ignore", invalid="ignore"):
+        whole = np.rint(values / scale)
+        whole[missing] = fill
+        if not ((whole >= limits.min) & (whole <= limits.max)).all():
+            return None
+    counts = whole.astype(dtype)
+    same = (counts * np.float64(scale)).view(np.int64) == np.ascontiguousarray(values, dtype=np.float64).view(np.int64)
+    same &= counts != fill
+    same |= missing
+    return counts if same.all() else None
+
+
+def from_counts(counts: NDArray[np.integer[Any]], scale: float, fill: int) -> NDArray[np.float64]:
+    """Counts times their factor, NaN for `fill`.
+
+    Examples
+    --------
+    >>> from_counts(np.array([1, -32767, 3], dtype="i2"), 0.1, -32767)
+    array([0.1, nan, 0.3])
+    """
+    values = np.multiply(counts, np.float64(scale), dtype=np.float64)
+    values[counts == fill] = np.nan
+    return values
