@@ -1,0 +1,1 @@
+"""Physical effects in the log of a fiber-optic gyro; one module for a family of effects, found by `gyrostab.physics.registry`."""

@@ -1,0 +1,387 @@
+"""The frame of a physical effect: its parameters, and its three faces *generate*, *explain* and *say*.
+
+An effect is one frozen dataclass that inherits from `Effect`. Its fields are its parameters, made with `parameter`; the rest it
+says in class attributes. `gyrostab.physics.registry` finds it by itself. See docs/physics/README.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError, SchemaError
+
+__all__ = ["STAGES", "Chunk", "Effect", "Parameter", "Prediction", "Setup", "Stage", "Windows", "parameter"]
+
+Array = NDArray[np.float64]
+Stage = Literal["motion", "noise", "rate", "sensor", "electronics", "sampling", "logger"]
+
+#: What happens to a signal, in the order in which it happens.
+STAGES: tuple[Stage, ...] = ("motion", "noise", "rate", "sensor", "electronics", "sampling", "logger")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What is known of one parameter of an effect.
+
+    Attributes
+    ----------
+    name : str
+        Its name in a model.
+    unit : str
+        Unit of its number as people write it ("deg/h/degC"); "text" for a word.
+    meaning : str
+        What it is, in a few words.
+    default : object
+        Value when a model does not give it; None where it must be given.
+    typical : object
+        A published or estimated size, for documentation and tests.
+    low, high : float
+        Allowed range, ends included.
+    choices : tuple of str
+        Allowed words, for a parameter that is a word.
+    many : bool
+        One number for each of the effect's axes instead of one number.
+    source : str
+        Where the typical size comes from: author and year, or "estimate".
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    default: Any
+    typical: Any
+    low: float
+    high: float
+    choices: tuple[str, ...]
+    many: bool
+    source: str
+
+    def check(self, value: Any, effect: str) -> Any:
+        """Give `value` back as a float (a tuple of them, a word), or raise `OptionError`."""
+        where = f"effect {effect!r}, parameter {self.name!r}"
+        if self.choices:
+            if value not in self.choices:
+                raise OptionError(f"{where}: {value!r} is not one of {', '.join(self.choices)}")
+            return value
+        given = tuple(value) if isinstance(value, list | tuple) else (value,)
+        if isinstance(value, list | tuple) and not self.many:
+            raise OptionError(f"{where}: give one number in {self.unit}, not the list {value!r}")
+        for number in given:
+            if isinstance(number, bool) or not isinstance(number, int | float | np.number) or math.isnan(number):
+                raise OptionError(f"{where}: {number!r} is not a number; give one in {self.unit}")
+            if not self.low <= number <= self.high:
+                raise OptionError(f"{where}: {number:g} {self.unit} is outside of the allowed range {self.low:g} to {self.high:g}")
+        return tuple(float(number) for number in given) if self.many else float(value)
+
+
+def parameter(
+    unit: str,
+    meaning: str,
+    *,
+    default: Any = None,
+    typical: Any = None,
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+    many: bool = False,
+    source: str = "estimate",
+) -> Any:
+    """Declare a field of an effect; see `Parameter` for the arguments. Without a default a model must give it."""
+    known = {"unit": unit, "meaning": meaning, "typical": default if typical is None else typical, "low": low, "high": high}
+    known |= {"choices": choices, "many": many, "source": source, "default": default}
+    return field(metadata={"parameter": known}) if default is None else field(default=default, metadata={"parameter": known})
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What stays the same over a whole simulation; see `Chunk` for the meaning of what the two share.
+
+    Attributes
+    ----------
+    rate : float
+        Samples in a second at the effect's stage [Hz].
+    size : int
+        Samples of the whole log at that rate.
+    start : int
+        Stamp of sample 0 [ns since 1970].
+    axes : tuple of str
+        The effect's axes, in the order of the rows of every array.
+    noise : mapping of str to ndarray, shape (axes,)
+        Noise coefficients of the model by symbol [unit of the law]: Q, N, B, K, R.
+    gaps : ndarray of int64, shape (n, 2)
+        All gaps of the log, [first missing sample, first sample after].
+    restarts : ndarray of int64, shape (n, 2)
+        All losses of power, [sample at which it went, sample at which it came back]; the start of the log is not among them.
+    oversampling : int
+        Samples that the instrument takes in one sampling interval of the log; `rate` is so much higher before the stage "logger".
+    """
+
+    rate: float
+    size: int
+    start: int
+    axes: tuple[str, ...]
+    noise: Mapping[str, Array] = field(default_factory=dict)
+    gaps: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    restarts: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    oversampling: int = 1
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A stretch of time, as *generate* gets it. Sample i stands for the interval from ``seconds[i]`` to ``seconds[i] + 1 / rate``.
+
+    Attributes
+    ----------
+    setup : Setup
+        Rate, axes, gaps and all else that does not change.
+    first : int
+        Number of the first sample, counted from the start of the log.
+    size : int
+        Number of samples.
+    drivers : mapping of str to ndarray, shape (size,)
+        Channels that the effect needs, by the names of `Effect.channels`, without NaN, in the units given there.
+    true : mapping of str to ndarray, shape (size,)
+        True rotation rate of every axis of the log [degree hour-1], also those that the effect does not act on; complete after "motion".
+    signal : ndarray, shape (axes, size)
+        What has come so far [degree hour-1]; for the stages "sensor" and later.
+    level : mapping of str to ndarray, shape (axes, size)
+        Squared noise coefficients by symbol so far; for the stage "noise".
+    """
+
+    setup: Setup
+    first: int
+    size: int
+    drivers: Mapping[str, Array] = field(default_factory=dict)
+    true: Mapping[str, Array] = field(default_factory=dict)
+    signal: Array = field(default_factory=lambda: np.empty((0, 0)))
+    level: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def rate(self) -> float:
+        """Samples in a second [Hz]."""
+        return self.setup.rate
+
+    @property
+    def seconds(self) -> Array:
+        """Time of every sample since the start of the log [s]."""
+        return (self.first + np.arange(self.size)) / self.setup.rate
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of the result, (axes, samples)."""
+        return len(self.setup.axes), self.size
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The reduced data that *explain* speaks about: means over windows, and spectra in the same windows.
+
+    Attributes
+    ----------
+    begin, end : ndarray, shape (window,)
+        Edges of the windows since the start of the log [s].
+    frequency : ndarray, shape (band,)
+        Centres of the bands of the spectra [Hz].
+    rate : float
+        Sampling rate of the log [Hz].
+    axes : tuple of str
+        The axes looked at.
+    drivers : mapping of str to ndarray, shape (window,)
+        Channels averaged over each window, by the names of `Effect.channels`; vibration as the rms over the window.
+    own : mapping of str to ndarray, shape (window,)
+        Measured rate of every axis of the log, averaged over each window [degree hour-1].
+    gaps, restarts : ndarray, shape (n, 2)
+        As in `Setup`, in seconds.
+    """
+
+    begin: Array
+    end: Array
+    frequency: Array
+    rate: float
+    axes: tuple[str, ...]
+    drivers: Mapping[str, Array] = field(default_factory=dict)
+    own: Mapping[str, Array] = field(default_factory=dict)
+    gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
+    restarts: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+    @property
+    def centre(self) -> Array:
+        """Middle of every window since the start of the log [s]."""
+        return (self.begin + self.end) / 2.0
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What an effect predicts for `Windows`; each part that it leaves empty it does not touch.
+
+    The parts are linear in the parameters named by their keys, so that a fit can solve for these; a parameter in which the effect
+    is not linear is one of `Effect.nuisance`, and is held at the value of the effect that was asked.
+
+    Attributes
+    ----------
+    mean : mapping of str to ndarray, shape (window,) or (axis, window)
+        Parameter -> window mean per unit of it [degree hour-1 per unit].
+    level : mapping of (str, str) to ndarray, shape (window,) or (axis, window)
+        (symbol of the noise term, parameter) -> change of the term's squared coefficient per unit, as a share of it.
+    spectrum : mapping of str to ndarray, shape (window, band)
+        Parameter -> added two-sided power spectral density per unit of its square [degree2 hour-2 Hz-1].
+    response : ndarray, shape (band,), or None
+        Squared magnitude by which the whole spectrum is multiplied (a filter).
+    coherent : bool
+        The added spectrum is one process on all axes: it fills the cross-spectra too, with one factor (and sign) per axis.
+    line : ndarray, shape (window,) or (harmonic, window), or None
+        Frequency of a line in every window [Hz], folded below half of the sampling rate.
+    """
+
+    mean: Mapping[str, Array] = field(default_factory=dict)
+    level: Mapping[tuple[str, str], Array] = field(default_factory=dict)
+    spectrum: Mapping[str, Array] = field(default_factory=dict)
+    response: Array | None = None
+    coherent: bool = False
+    line: Array | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """A physical effect. A subclass is a frozen dataclass (``kw_only=True``) whose fields are made with `parameter`.
+
+    Class attributes
+    ----------------
+    name : str
+        Name in models, results and documents.
+    short : str
+        What it does, in a few words.
+    stage : str
+        One of `STAGES`; it says what *generate* returns, see there.
+    channels : mapping of str to str
+        Channels that drive it -> the unit they must have (`gyrostab.units.INNER`).
+    size_parameters : tuple of str
+        Parameters that switch the effect off when all of them are zero.
+    references : tuple of str
+        Where the equation and the sizes come from.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        Axes of the log that it acts on; empty for all.
+    driver : tuple of str
+        Names that its channels have in the log, in the order of `channels`; empty when they have the same.
+    """
+
+    name: ClassVar[str] = ""
+    short: ClassVar[str] = ""
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = {}
+    size_parameters: ClassVar[tuple[str, ...]] = ()
+    references: ClassVar[tuple[str, ...]] = ()
+
+    axes: tuple[str, ...] = ()
+    driver: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for known in self.parameters():
+            object.__setattr__(self, known.name, known.check(getattr(self, known.name), self.name))
+        for name in ("axes", "driver"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
+        if self.driver and len(self.driver) != len(self.channels):
+            needs = ", ".join(self.channels) or "no channel"
+            raise OptionError(f"effect {self.name!r}: driver names {len(self.driver)} channels; it takes {needs}, in this order")
+        for known in self.parameters():
+            if known.many and self.axes and len(getattr(self, known.name)) != len(self.axes):
+                raise OptionError(f"effect {self.name!r}, parameter {known.name!r}: give one number for each of the axes {list(self.axes)}")
+
+    @classmethod
+    def parameters(cls) -> tuple[Parameter, ...]:
+        """The parameters, in the order of the class."""
+        return tuple(Parameter(name=item.name, **item.metadata["parameter"]) for item in fields(cls) if "parameter" in item.metadata)
+
+    @classmethod
+    def required(cls) -> tuple[str, ...]:
+        """Names of the parameters that a model must give."""
+        return tuple(item.name for item in fields(cls) if item.default is MISSING and "parameter" in item.metadata)
+
+    @classmethod
+    def example(cls, **values: Any) -> Self:
+        """The effect with its typical sizes, and `values` in place of some of them."""
+        return cls(**{known.name: known.typical for known in cls.parameters()} | values)
+
+    def switched_off(self) -> Self:
+        """The same effect with zero size."""
+        zero: dict[str, Any] = {known.name: (0.0,) * len(getattr(self, known.name)) if known.many else 0.0 for known in self.parameters()}
+        return replace(self, **{name: zero[name] for name in self.size_parameters})
+
+    def needs(self) -> tuple[str, ...]:
+        """Channels (of `channels`) without which it cannot be generated with these parameters."""
+        return tuple(self.channels)
+
+    def channel_names(self) -> dict[str, str]:
+        """Channel of `channels` -> its name in the log."""
+        return dict(zip(self.channels, self.driver or self.channels, strict=True))
+
+    # ------------------------------------------------------------------------------------------------------- three faces
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """State before the first sample; anything that can be copied. What is random keeps `rng` (or children of it) here."""
+        return None
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Any, Any]:
+        """Return what the effect does to a stretch of time, and the state after it.
+
+        The state given may be changed in place. The result must not depend on how time is cut into chunks.
+
+        Returns
+        -------
+        values
+            By stage: "motion" and "rate": contribution to the rate [degree hour-1], shape (axes, size) or (size,).
+            "noise": mapping of changed symbols to squared coefficients, from `Chunk.level`.
+            "sensor", "electronics", "logger": the signal afterwards, shape (axes, size).
+            "sampling": the same, or with ``size / oversampling`` samples where it picks or averages the samples of the log.
+        state
+        """
+        raise NotImplementedError
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """Parameters in which the effect is not linear -> values worth a try on these data."""
+        return {}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Predict the reduced data, with the non-linear parameters at their values."""
+        raise NotImplementedError
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say in one sentence what it does, with its numbers and, where given, their standard errors."""
+        raise NotImplementedError
+
+    # ----------------------------------------------------------------------------------------------------------- phrases
+
+    def on_axes(self) -> str:
+        """``"on axis x"``, ``"on axes x and y"``, ``"on all axes"``: for sentences."""
+        if not self.axes:
+            return "on all axes"
+        names = " and ".join(filter(None, [", ".join(self.axes[:-1]), self.axes[-1]]))
+        return f"on ax{'i' if len(self.axes) == 1 else 'e'}s {names}"
+
+    def quantity(self, name: str, errors: Mapping[str, float] | None = None) -> str:
+        """A parameter with its error and unit: ``"0.4 ± 0.1 deg/h"``."""
+        unit = next(known.unit for known in self.parameters() if known.name == name)
+        value = getattr(self, name)
+        text = ", ".join(f"{one:.4g}" for one in value) if isinstance(value, tuple) else f"{value:.4g}"
+        if errors and name in errors:
+            text += f" ± {errors[name]:.2g}"
+        return text if unit in ("1", "text") else f"{text} {unit}"
+
+
+def driver_error(effect: Effect, channel: str, present: list[str]) -> SchemaError:
+    """The complaint that an effect's channel is not there."""
+    name = effect.channel_names()[channel]
+    return SchemaError(
+        f"effect {effect.name!r} needs the channel {name!r} [{effect.channels[channel]}]; "
+        f"there are {', '.join(present) or 'no channels'}; add it to the environment or name another with driver = ..."
+    )

@@ -1,0 +1,1 @@
+"""Simulated logs: noise, environment and physical effects."""
