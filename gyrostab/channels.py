@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import dask
@@ -13,15 +14,21 @@ from numpy.typing import NDArray
 from gyrostab.kernels.trend import window_trend
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels
+from gyrostab.timegrid import first_stamp, grid_times
 from gyrostab.units import INNER
 
-__all__ = ["window_channels"]
+__all__ = ["in_memory", "window_channels"]
 
 TEMPERATURE_RATE = "K hour-1"
 
 
+def in_memory(values: Any) -> NDArray[np.generic]:
+    """The array itself; one of dask is computed in the calling thread, whatever scheduler is set."""
+    return np.asarray(values.compute(scheduler="synchronous") if isinstance(values, da.Array) else values)
+
+
 def window_channels(
-    log: xr.Dataset, bounds: NDArray[np.int64], first: NDArray[np.int64], last: NDArray[np.int64]
+    log: xr.Dataset, window: int, step: int, groups: Sequence[slice], *, part: slice | None = None
 ) -> dict[str, xr.Variable]:
     """Mean of every channel over each window, and the rate of change of every temperature.
 
@@ -29,28 +36,36 @@ def window_channels(
     ----------
     log : xarray.Dataset
         Regular log; a channel lies on ``time`` or on its own ``time_<channel>``.
-    bounds : int64 (n_windows, 2)
-        First and one-past-last instant of the windows [ns since 1970].
-    first, last : int64 (n_windows,)
-        The same as sample numbers of the log.
+    window, step : int
+        Length of the windows, and from one to the next [samples of the log].
+    groups : sequence of slice
+        Windows that are computed together, so that a long channel is never held whole; all windows, in order.
+    part : slice, optional
+        Only these windows, at once and in the calling thread.
 
     Returns
     -------
     dict of str to xarray.Variable
         ``<channel>(time)`` [unit of the channel] and, for temperatures, ``<channel>_rate(time)`` [K hour-1]; dask where
-        the channel is.
+        the channel is, and no part is asked for.
     """
     out: dict[str, xr.Variable] = {}
+    rate, start = float(log.attrs["sampling_rate_hz"]), first_stamp(log)
     for name in log_channels(log):
         channel = log[name]
         if not np.issubdtype(channel.dtype, np.number):
             continue
-        if channel.dims == ("time",):
-            a, b, stamps = first, last, None
-        else:
+        stamps = None
+        if channel.dims != ("time",):
             stamps = channel[f"time_{name}"].values.astype("datetime64[ns]").astype(np.int64)
-            a, b = np.searchsorted(stamps, bounds[:, 0]), np.searchsorted(stamps, bounds[:, 1])
-        mean, slope = _means(channel.data, stamps, float(log.attrs["sampling_rate_hz"]), a, b)
+
+        def ends(group: slice, stamps: NDArray[np.int64] | None = stamps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+            first = np.arange(group.start, group.stop) * step
+            if stamps is None:
+                return first, first + window
+            return tuple(np.searchsorted(stamps, grid_times(start, rate, edge)) for edge in (first, first + window))  # type: ignore[return-value]
+
+        mean, slope = _means(channel.data, stamps, rate, groups, ends, part)
         units = channel.attrs.get("units", "1")
         label = str(channel.attrs.get("long_name", name.replace("_", " ")))
         out[name] = xr.Variable(("time",), mean, {"long_name": f"{label}, mean of the window", "units": units})
@@ -67,18 +82,27 @@ def _trend(values: Any, stamps: NDArray[np.int64] | None, rate: float, a: NDArra
     return np.asarray(window_trend(data, seconds, a, b))
 
 
-def _means(data: Any, stamps: NDArray[np.int64] | None, rate: float, a: NDArray[np.int64], b: NDArray[np.int64]) -> tuple[Any, Any]:
-    """Mean and slope per window, in groups of windows so that a long channel is never held whole."""
-    lazy = isinstance(data, da.Array)
-    longest = max(1, int(np.max(b - a, initial=1)))
-    per_group = max(8, 2**20 // longest)
+def _means(
+    data: Any,
+    stamps: NDArray[np.int64] | None,
+    rate: float,
+    groups: Sequence[slice],
+    ends: Callable[[slice], tuple[NDArray[np.int64], NDArray[np.int64]]],
+    part: slice | None,
+) -> tuple[Any, Any]:
+    """Mean and slope per window, group by group; `ends` gives the bounds of a group's windows in the channel."""
+    lazy = isinstance(data, da.Array) and part is None
+    kept = slice(0, groups[-1].stop) if part is None else part
+    chosen = [group for group in groups if group.start < kept.stop and group.stop > kept.start]
     parts = []
-    for begin in range(0, a.size, per_group):
-        group = slice(begin, begin + per_group)
-        low, high = int(a[group][0]), int(b[group][-1])
+    for group in chosen:
+        a, b = ends(group)
+        low, high = int(a[0]), int(b[-1])
         piece = None if stamps is None else stamps[low:high]
-        one = dask.delayed(_trend, pure=False)(data[low:high], piece, rate, a[group] - low, b[group] - low)
-        parts.append(da.from_delayed(one, (2, a[group].size), dtype=np.float64))
-    both = da.concatenate(parts, axis=1)
-    both = both if lazy else both.compute()
+        if lazy:
+            one = dask.delayed(_trend, pure=False)(data[low:high], piece, rate, a - low, b - low)
+            parts.append(da.from_delayed(one, (2, a.size), dtype=np.float64))
+        else:
+            parts.append(_trend(in_memory(data[low:high]), piece, rate, a - low, b - low))
+    both = (da if lazy else np).concatenate(parts, axis=1)[:, kept.start - chosen[0].start : kept.stop - chosen[0].start]
     return both[0], both[1]

@@ -12,7 +12,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.channels import window_channels
+from gyrostab.channels import in_memory, window_channels
 from gyrostab.errors import OptionError
 from gyrostab.kernels.covariance import diagonal_products
 from gyrostab.kernels.least_squares import identify_noise
@@ -20,16 +20,14 @@ from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_theta
 from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
 from gyrostab.noise import HOUR, avar_columns, sample_squares
-from gyrostab.schema import attributes, check_log, signal_name
+from gyrostab.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
+from gyrostab.schema import attributes
 from gyrostab.timegrid import first_stamp, grid_times
-from gyrostab.windows import averaging_factors, samples, thin
 
-__all__ = ["davar"]
+__all__ = ["davar", "davar_part", "davar_parts"]
 
-_METHODS = ("blocks", "direct", "recursive")
-_GAPS = ("bridge", "zero")
-_OVERLAPS = ("full", "octave")
-_CONVENTIONS = ("all", "paper")
+#: Samples of a part up to which all its axes are read together.
+_TOGETHER = 2**24
 
 
 def davar(
@@ -116,81 +114,99 @@ def davar(
     >>> float(surface.avar.sel(tau=0.01).mean())  # white noise: avar = sd^2 / k
     0.99...
     """
-    check_log(log)
-    _check_choices(method=method, gaps=gaps, overlap=overlap, convention=convention)
-    name = signal_name(log)
-    signal = log[name] if axis is None else _pick(log[name], axis)
-    rate = float(log.attrs["sampling_rate_hz"])
-    intervals = signal.sizes["time"] - (1 if name == "angle" else 0)
-    length, hop = _window_and_step(window, step, rate, intervals)
-    ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max)
-    shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
-    ks = np.unique(ks >> shifts << shifts)
-    shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
-    unit = Unit(length, hop, ks, shifts, name == "angle", 1.0 / rate, gaps == "zero", min_strict, min_coverage)
-    if method == "blocks":
-        cells, means = _blocks(signal.data, unit, rate)
-    else:
-        cells, means = _reference(signal, unit, rate, method, paper=convention == "paper")
-    surface = _label(cells, means, log, signal, unit, rate)
-    surface.attrs.update(
-        {
-            "window_s": length / rate, "step_s": hop / rate, "window_samples": length, "step_samples": hop,
-            "method": method, "overlap": overlap, "gaps": gaps, "convention": convention,
-            "min_strict": min_strict, "min_coverage": min_coverage,
-        }
+    plan = make_plan(
+        log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis, overlap=overlap, gaps=gaps, min_strict=min_strict,
+        min_coverage=min_coverage, method=method, convention=convention,
     )  # fmt: skip
-    return surface
+    if method == "blocks":
+        cells, means = _blocks(plan.signal.data, plan.unit, plan.rate)
+    else:
+        cells, means = _reference(plan.signal, plan.unit, plan.rate, method, paper=convention == "paper")
+    return _label(cells, means, log, plan)
 
 
-def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> None:
-    for option, value, choices in (
-        ("method", method, _METHODS),
-        ("gaps", gaps, _GAPS),
-        ("overlap", overlap, _OVERLAPS),
-        ("convention", convention, _CONVENTIONS),
-    ):
-        if value not in choices:
-            raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
-    if convention == "paper" and method == "blocks":
-        raise OptionError("convention='paper' is for method='direct' and method='recursive'; the block sums use all terms")
-    if overlap == "octave" and method != "blocks":
-        raise OptionError(f"overlap='octave' is for method='blocks'; method={method!r} uses every term")
+def davar_parts(log: xr.Dataset, *, samples: int = 2**23, **options: Any) -> list[slice]:
+    """Cut the windows of a surface into parts that `davar_part` computes, each of whole units of work.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        Regular log.
+    samples : int
+        Samples of a part over all axes; it gets one unit of work at least. Where windows are close, a part gets fewer.
+    **options
+        Options of `davar`.
+
+    Returns
+    -------
+    list of slice
+        Windows of each part, counted from the first window of the log.
+
+    Examples
+    --------
+    >>> from gyrostab.log import make_log
+    >>> davar_parts(make_log(np.zeros(10**6), rate=100.0, unit="deg/h"), samples=500_000, window="1min", step="30s")
+    [slice(0, 85, None), slice(85, 170, None), slice(170, 255, None), slice(255, 332, None)]
+    """
+    plan = make_plan(log, **options)
+    axes, size = plan.signal.shape
+    units = units_of_work(size, plan.unit)
+    per_unit = max(1, units[0].stop - units[0].start)
+    cells = axes * plan.unit.ks.size
+    together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit)))
+    return [slice(units[i].start, units[min(i + together, len(units)) - 1].stop) for i in range(0, len(units), together)]
 
 
-def _pick(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
-    wanted = [axis] if isinstance(axis, str) else list(axis)
-    known = [str(name) for name in signal["axis"].values]
-    unknown = [name for name in wanted if name not in known]
-    if unknown or not wanted:
-        raise OptionError(f"axis {unknown or wanted} is not in the log; it has {known}")
-    return signal.sel(axis=wanted)
+def davar_part(log: xr.Dataset, *, part: slice, **options: Any) -> xr.Dataset:
+    """Some windows of the surface that `davar` makes, computed at once and in the calling thread.
 
+    Only the samples of these windows are read, and dask is not asked to compute anything beside that, so that many parts
+    can be computed side by side, in threads, processes or on other machines. The numbers are those of `davar`, bit for bit.
 
-def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tuple[int, int]:
-    length = samples(window, rate, "window")
-    if length > available:
-        raise OptionError(
-            f"the window of {length / rate:g} s ({length} samples) is longer than the record of {available / rate:g} s; "
-            "give a shorter --window"
-        )
-    if length < 4:
-        raise OptionError(f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at {rate:g} Hz)")
-    hop = max(1, length // 10) if step is None else samples(step, rate, "step")
-    if hop > length:
-        raise OptionError(
-            f"the step of {hop / rate:g} s is longer than the window of {length / rate:g} s, so samples would be left out; "
-            "give a shorter --step"
-        )
-    return length, hop
+    Parameters
+    ----------
+    log : xarray.Dataset
+        Regular log, numpy or dask.
+    part : slice
+        Windows, counted from the first window of the log: one of `davar_parts`, or any other without a step.
+    **options
+        Options of `davar`, with ``method="blocks"``.
 
+    Returns
+    -------
+    xarray.Dataset
+        As from `davar`, in memory.
 
-def _units_of_work(n_samples: int, unit: Unit) -> list[tuple[int, int]]:
-    """First and one-past-last sample of each unit of work; they depend on the windows alone, not on any chunking."""
-    points = unit.window + (1 if unit.angle else 0)
-    n_windows = (n_samples - points) // unit.step + 1
-    per_unit = max(8, (max(4 * unit.window, 2**18) - unit.window) // unit.step)
-    return [(first * unit.step, (min(first + per_unit, n_windows) - 1) * unit.step + points) for first in range(0, n_windows, per_unit)]
+    Raises
+    ------
+    OptionError
+        When the options do not fit, or another method than the block sums is asked for.
+
+    Examples
+    --------
+    >>> from gyrostab.log import make_log
+    >>> log = make_log(np.arange(60_000.0) % 7, rate=100.0, unit="deg/h")
+    >>> part = davar_part(log, part=slice(3, 5), window="1min", step="30s")
+    >>> part.equals(davar(log, window="1min", step="30s").isel(time=slice(3, 5)))
+    True
+    """
+    plan = make_plan(log, **options)
+    if plan.attrs["method"] != "blocks":
+        raise OptionError(f"method={plan.attrs['method']!r} is for whole logs; parts are computed with method='blocks'")
+    data, unit = plan.signal.data, plan.unit
+    tables = _noise_tables(unit, plan.rate)
+    units = [one for one in units_of_work(data.shape[1], unit) if one.start < part.stop and one.stop > part.start]
+    begin, end = units[0].start * unit.step, last_sample(units[-1], unit)
+    together = range(0, data.shape[0], 1 if data.shape[0] * (end - begin) > _TOGETHER else data.shape[0])
+    cells, means = [], []
+    for row in together:
+        values = in_memory(data[row : row + together.step, begin:end])
+        for line in values:
+            done = [_work(line[one.start * unit.step - begin : last_sample(one, unit) - begin], unit, tables) for one in units]
+            cells.append(np.concatenate([one[0] for one in done], axis=1))
+            means.append(np.concatenate([one[1] for one in done], axis=1))
+    kept = slice(part.start - units[0].start, part.stop - units[0].start)
+    return _label(np.stack(cells, axis=1)[:, :, kept], np.stack(means, axis=1)[:, :, kept], log, plan, part=part)
 
 
 def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -224,9 +240,9 @@ def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
     rows_cells, rows_means = [], []
     for row in range(data.shape[0]):
         cells, means = [], []
-        for start, stop in _units_of_work(data.shape[1], unit):
-            n = (stop - start - unit.window - (1 if unit.angle else 0)) // unit.step + 1
-            one_cells, one_means = work(data[row, start:stop], unit, shared)
+        for windows in units_of_work(data.shape[1], unit):
+            n = windows.stop - windows.start
+            one_cells, one_means = work(data[row, windows.start * unit.step : last_sample(windows, unit)], unit, shared)
             cells.append(da.from_delayed(one_cells, (len(CELL_FIELDS) + 1, n, unit.ks.size), dtype=np.float64))
             means.append(da.from_delayed(one_means, (2, n), dtype=np.float64))
         rows_cells.append(da.concatenate(cells, axis=1))
@@ -265,10 +281,11 @@ def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, pa
     return cells, means
 
 
-def _label(cells: Any, means: Any, log: xr.Dataset, signal: xr.DataArray, unit: Unit, rate: float) -> xr.Dataset:
+def _label(cells: Any, means: Any, log: xr.Dataset, plan: Plan, *, part: slice | None = None) -> xr.Dataset:
     cube, plane = ("axis", "time", "tau"), ("axis", "time")
-    start = first_stamp(log)
-    first = np.arange(cells.shape[2]) * unit.step
+    signal, unit, rate, _ = plan
+    start, begin = first_stamp(log), 0 if part is None else part.start
+    first = (begin + np.arange(cells.shape[2])) * unit.step
     bounds = np.stack([grid_times(start, rate, first), grid_times(start, rate, first + unit.window)], axis=-1)
     centre = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     names = (*CELL_FIELDS, "edf")
@@ -288,8 +305,11 @@ def _label(cells: Any, means: Any, log: xr.Dataset, signal: xr.DataArray, unit: 
             "tau": ("tau", unit.ks / rate, attributes("tau")),
             "time_bounds": (("time", "bnds"), bounds.view("datetime64[ns]")),
         },
-        attrs=dict(log.attrs),
+        attrs={**log.attrs, **plan.attrs},
     )
     # The share of degrees of freedom that the gaps leave is what a fit needs beside the responses.
     surface["gap_factor"] = (cube, cells[CELL_FIELDS.index("gap_factor")], attributes("gap_factor"))
-    return surface.assign(window_channels(log, bounds, first, first + unit.window))
+    groups = units_of_work(signal.sizes["time"], unit)
+    if part is None:  # the paper's convention leaves out the last window
+        groups = [slice(one.start, min(one.stop, first.size)) for one in groups if one.start < first.size]
+    return surface.assign(window_channels(log, unit.window, unit.step, groups, part=part))

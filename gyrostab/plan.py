@@ -1,0 +1,113 @@
+"""What a dynamic Allan variance is asked for, in samples, and how it is cut into units of work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import OptionError
+from gyrostab.kernels.surface import Unit
+from gyrostab.schema import check_log, signal_name
+from gyrostab.windows import averaging_factors, samples, thin
+
+__all__ = ["MOST_CELLS", "Plan", "last_sample", "make_plan", "units_of_work"]
+
+#: Cells (windows times averaging times) of a unit of work, and of a part of a surface over all axes, at most.
+MOST_CELLS = 2**20
+_METHODS = ("blocks", "direct", "recursive")
+_GAPS = ("bridge", "zero")
+_OVERLAPS = ("full", "octave")
+_CONVENTIONS = ("all", "paper")
+
+
+class Plan(NamedTuple):
+    """What davar was asked for, in samples."""
+
+    signal: xr.DataArray
+    unit: Unit
+    rate: float
+    attrs: dict[str, Any]
+
+
+def make_plan(
+    log: xr.Dataset, *, window: Any, step: Any = None, taus: Any = 40, tau_max: Any = None, axis: str | Sequence[str] | None = None,
+    overlap: str = "full", gaps: str = "bridge", min_strict: float = 0.3, min_coverage: float = 0.1, method: str = "blocks",
+    convention: str = "all",
+) -> Plan:  # fmt: skip
+    """Check the options of `davar` against the log."""
+    check_log(log)
+    _check_choices(method=method, gaps=gaps, overlap=overlap, convention=convention)
+    name = signal_name(log)
+    signal = log[name] if axis is None else _pick(log[name], axis)
+    rate = float(log.attrs["sampling_rate_hz"])
+    intervals = signal.sizes["time"] - (1 if name == "angle" else 0)
+    length, hop = _window_and_step(window, step, rate, intervals)
+    ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max)
+    shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
+    ks = np.unique(ks >> shifts << shifts)
+    shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
+    unit = Unit(length, hop, ks, shifts, name == "angle", 1.0 / rate, gaps == "zero", min_strict, min_coverage)
+    attrs = {
+        "window_s": length / rate, "step_s": hop / rate, "window_samples": length, "step_samples": hop,
+        "method": method, "overlap": overlap, "gaps": gaps, "convention": convention,
+        "min_strict": min_strict, "min_coverage": min_coverage,
+    }  # fmt: skip
+    return Plan(signal, unit, rate, attrs)
+
+
+def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> None:
+    for option, value, choices in (
+        ("method", method, _METHODS),
+        ("gaps", gaps, _GAPS),
+        ("overlap", overlap, _OVERLAPS),
+        ("convention", convention, _CONVENTIONS),
+    ):
+        if value not in choices:
+            raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
+    if convention == "paper" and method == "blocks":
+        raise OptionError("convention='paper' is for method='direct' and method='recursive'; the block sums use all terms")
+    if overlap == "octave" and method != "blocks":
+        raise OptionError(f"overlap='octave' is for method='blocks'; method={method!r} uses every term")
+
+
+def _pick(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
+    wanted = [axis] if isinstance(axis, str) else list(axis)
+    known = [str(name) for name in signal["axis"].values]
+    unknown = [name for name in wanted if name not in known]
+    if unknown or not wanted:
+        raise OptionError(f"axis {unknown or wanted} is not in the log; it has {known}")
+    return signal.sel(axis=wanted)
+
+
+def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tuple[int, int]:
+    length = samples(window, rate, "window")
+    if length > available:
+        raise OptionError(
+            f"the window of {length / rate:g} s ({length} samples) is longer than the record of {available / rate:g} s; "
+            "give a shorter --window"
+        )
+    if length < 4:
+        raise OptionError(f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at {rate:g} Hz)")
+    hop = max(1, length // 10) if step is None else samples(step, rate, "step")
+    if hop > length:
+        raise OptionError(
+            f"the step of {hop / rate:g} s is longer than the window of {length / rate:g} s, so samples would be left out; "
+            "give a shorter --step"
+        )
+    return length, hop
+
+
+def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
+    """Windows of each unit of work; they depend on the windows alone, not on any chunking."""
+    points = unit.window + (1 if unit.angle else 0)
+    n_windows = (n_samples - points) // unit.step + 1
+    per_unit = max(8, min((max(4 * unit.window, 2**18) - unit.window) // unit.step, MOST_CELLS // unit.ks.size))
+    return [slice(first, min(first + per_unit, n_windows)) for first in range(0, n_windows, per_unit)]
+
+
+def last_sample(windows: slice, unit: Unit) -> int:
+    """One past the last sample of some windows."""
+    return int((windows.stop - 1) * unit.step + unit.window + (1 if unit.angle else 0))
