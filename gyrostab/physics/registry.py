@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import importlib
 import pkgutil
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from types import MappingProxyType
@@ -17,7 +18,7 @@ from gyrostab.errors import OptionError, UnitError
 from gyrostab.physics.base import Effect, Parameter
 from gyrostab.units import parse_unit
 
-__all__ = ["effect_table", "effects", "make_effect"]
+__all__ = ["amount", "close_to", "effect_table", "effects", "make_effect"]
 
 
 @cache
@@ -70,7 +71,7 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     if name is None:
         raise OptionError(f"{where}: an effect has no name; write name = ... with one of {', '.join(effects())}")
     if name not in effects():
-        raise OptionError(f"{where}: there is no effect {name!r}{_close(name, list(effects()))}; there are {', '.join(effects())}")
+        raise OptionError(f"{where}: there is no effect {name!r}{close_to(name, list(effects()))}; there are {', '.join(effects())}")
     kind = effects()[name]
     known = {item.name: item for item in kind.parameters()}
     values = {key: value for key, value in table.items() if key != "name"}
@@ -78,7 +79,7 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
         if key not in known and key not in ("axes", "driver"):
             listed = ", ".join(f"{item.name} [{item.unit}]" for item in known.values())
             raise OptionError(
-                f"{where}: effect {name!r} has no parameter {key!r}{_close(key, list(known))}; it has {listed}, and axes and driver"
+                f"{where}: effect {name!r} has no parameter {key!r}{close_to(key, list(known))}; it has {listed}, and axes and driver"
             )
     for key in kind.required():
         if key not in values:
@@ -96,7 +97,8 @@ def _typical(item: Parameter) -> str:
     return f"for instance {item.typical}"
 
 
-def _close(word: Any, words: Sequence[str]) -> str:
+def close_to(word: Any, words: Sequence[str]) -> str:
+    """The end of a message about an unknown word: the nearest known one, or nothing."""
     close = difflib.get_close_matches(str(word), words, 1)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
@@ -106,27 +108,41 @@ _HERTZ = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "1/min": 1 / 60}
 
 
 def _number(value: Any, item: Parameter) -> Any:
-    """A value of a model: numbers as they are, text "3 min" converted to the parameter's unit."""
-    if isinstance(value, list):
-        return [_number(one, item) for one in value]
-    if not isinstance(value, str) or item.choices:
+    """A value of a model for this parameter, in its unit."""
+    return value if item.choices else amount(value, item.unit, f"parameter {item.name!r}")
+
+
+def amount(value: Any, unit: str, where: str) -> Any:
+    """Read a value of a model: a number as it is, text such as ``"3 min"`` converted to `unit`, a list one by one.
+
+    Raises
+    ------
+    OptionError
+        When the text is no number with a unit that fits.
+
+    Examples
+    --------
+    >>> amount("3 min", "s", "lag"), amount(0.4, "deg/h", "bias"), amount("300 K", "degC", "reference")
+    (180.0, 0.4, 26.85...)
+    """
+    if isinstance(value, list | tuple):
+        return [amount(one, unit, where) for one in value]
+    if not isinstance(value, str):
         return value
-    number, _, unit = value.strip().partition(" ")
-    try:
-        amount = float(number)
-    except ValueError:
-        raise OptionError(f"parameter {item.name!r}: {value!r} is not a number with a unit; write for instance '1 {item.unit}'") from None
-    unit = unit.strip()
-    if unit in ("", item.unit):
-        return amount
+    match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*", value)
+    if match is None:
+        raise OptionError(f"{where}: {value!r} is not a number with a unit; write for instance '1 {unit}'")
+    number, given = float(match.group(1)), match.group(2)
+    if given in ("", unit):
+        return number
     for table in (_SECONDS, _HERTZ):
-        if unit in table and item.unit in table:
-            return amount * table[unit] / table[item.unit]
+        if given in table and unit in table:
+            return number * table[given] / table[unit]
     with contextlib.suppress(UnitError):
-        given, wanted = parse_unit(unit), parse_unit(item.unit)
-        if given.quantity == wanted.quantity:
-            return (amount * given.factor + given.offset - wanted.offset) / wanted.factor
-    raise OptionError(f"parameter {item.name!r}: the unit {unit!r} is not known here; give the number in {item.unit}")
+        source, wanted = parse_unit(given), parse_unit(unit)
+        if source.quantity == wanted.quantity:
+            return (number * source.factor + source.offset - wanted.offset) / wanted.factor
+    raise OptionError(f"{where}: the unit {given!r} is not known here; give the number in {unit}")
 
 
 def effect_table() -> pd.DataFrame:

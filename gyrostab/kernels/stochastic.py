@@ -1,0 +1,197 @@
+"""Noise as an ideal gyro gives it, sample after sample: each sample is the mean rate over its own interval.
+
+All processes are exact in continuous time: their means over any number of samples have the Allan variance of the continuous law, not
+of a sampled one. All go on where they stopped, bit for bit, however the samples are cut into calls, because every sample uses its own
+fresh numbers, in their order. Strength one throughout; the caller gives units.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = [
+    "brownian_means",
+    "flicker_means",
+    "flicker_times",
+    "ornstein_uhlenbeck",
+    "ornstein_uhlenbeck_means",
+    "running_sum",
+    "sinusoid_means",
+]
+
+Array = NDArray[np.float64]
+
+#: Ratio of neighbouring correlation times in `flicker_times`: the Allan variance of their sum departs from flat by 0.2 %.
+RATIO = 5.0
+#: Shorter correlation times than this share of a sample are white noise to the samples.
+SHORTEST = 1.0 / 12.0
+
+
+def running_sum(steps: Array, carry: float) -> tuple[Array, float]:
+    """Cumulative sum of `steps` after `carry`, and the sum to carry on with.
+
+    Examples
+    --------
+    >>> running_sum(np.array([1.0, 2.0]), 10.0)
+    (array([11., 13.]), 13.0)
+    """
+    total = np.cumsum(np.concatenate([[carry], steps]))
+    return total[1:], float(total[-1])
+
+
+def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, float]:
+    """Means over the samples of a Brownian motion with the increments `steps`.
+
+    The mean over an interval with the increment d is the start plus d / 2 plus an independent part of variance 1/12 of the increment's; so
+    the mean over k samples has the Allan variance k / 3, with no correction for sampling.
+
+    Parameters
+    ----------
+    steps, inner : ndarray, shape (n,)
+        Increment of every sample, and the part inside of it: standard normal numbers times the standard deviation of the increment.
+    carry : float
+        Position at the start of the first sample.
+
+    Returns
+    -------
+    means : ndarray, shape (n,)
+    carry : float
+        Position at the end of the last sample.
+    """
+    end, last = running_sum(steps, carry)
+    return end - steps / 2.0 + inner / math.sqrt(12.0), last
+
+
+@njit(cache=True, nogil=True)
+def ornstein_uhlenbeck(normal: Array, decay: Array, weight: Array, position: Array) -> tuple[Array, Array]:
+    """Sum, at the two ends of every sample, of Ornstein-Uhlenbeck processes of unit variance.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (n, m)
+        Standard normal numbers, one for each sample and process.
+    decay : ndarray, shape (m,)
+        ``1 - exp(-1 / T)`` for the correlation times T [samples].
+    weight : ndarray, shape (m,)
+        Factor of each process in the sum of both ends.
+    position : ndarray, shape (m,)
+        Where the processes are at the start of the first sample.
+
+    Returns
+    -------
+    total : ndarray, shape (n,)
+        Sum over the processes of ``weight * (start + end)``.
+    position : ndarray, shape (m,)
+        Where they are at the end of the last sample.
+    """
+    n, m = normal.shape
+    total = np.empty(n)
+    x = position.copy()
+    kick = np.sqrt(decay * (2.0 - decay))
+    for i in range(n):
+        s = 0.0
+        for j in range(m):
+            before = x[j]
+            x[j] = before - decay[j] * before + kick[j] * normal[i, j]
+            s += weight[j] * (before + x[j])
+        total[i] = s
+    return total, x
+
+
+def _moments(samples: Array) -> tuple[Array, Array, Array]:
+    """Decay over a sample, weight of both ends in its mean, and variance of the rest of the mean, for correlation times [samples]."""
+    a = 1.0 / samples
+    decay = -np.expm1(-a)
+    weight = np.tanh(a / 2.0) / a
+    with np.errstate(over="ignore"):
+        exact = 2.0 * (a - decay) / a**2 - 2.0 * weight * decay / a
+    rest = np.where(a < 0.01, a / 6.0 - a**3 / 60.0, exact)  # the difference loses its digits where the process is slow
+    return decay, weight, rest
+
+
+def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> tuple[Array, float]:
+    """Means over the samples of an Ornstein-Uhlenbeck (first-order Gauss-Markov) process of unit variance.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (n, 2)
+        Standard normal numbers.
+    samples : float
+        Correlation time [samples].
+    position : float
+        Where the process is at the start; a standard normal number at the very start.
+
+    Returns
+    -------
+    means : ndarray, shape (n,)
+    position : float
+        Where it is at the end.
+
+    Examples
+    --------
+    >>> means, position = ornstein_uhlenbeck_means(np.zeros((3, 2)), 1.0, 1.0)
+    >>> means.round(4), round(position, 4)  # (1 - 1/e) e^-n and e^-3
+    (array([0.6321, 0.2325, 0.0855]), 0.0498)
+    """
+    decay, weight, rest = _moments(np.array([float(samples)]))
+    total, last = ornstein_uhlenbeck(np.ascontiguousarray(normal[:, :1]), decay, weight, np.array([position]))
+    return total + math.sqrt(rest[0]) * normal[:, 1], float(last[0])
+
+
+def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Array:
+    """Correlation times [s] of the processes that make flicker noise in samples at `rate` [Hz].
+
+    They stand in even log spacing, beginning at ``1 / (2 pi low)`` [s], so that another `rate` adds or takes only the short ones.
+    The sum has the two-sided density B^2 / (2 pi f) from about 3 times `low` to a third of `high` [Hz].
+    """
+    longest = 1.0 / (2.0 * math.pi * low)
+    shortest = max(1.0 / (2.0 * math.pi * high), SHORTEST / rate)
+    count = 1 + max(0, math.ceil(math.log(longest / shortest) / math.log(RATIO)))
+    return np.asarray(longest * RATIO ** -np.arange(count, dtype=np.float64))
+
+
+def flicker_means(normal: Array, times: Array, rate: float, position: Array, *, endless: bool = True) -> tuple[Array, Array]:
+    """Means over the samples of flicker noise with B = 1.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (n, m + 1)
+        Standard normal numbers.
+    times : ndarray, shape (m,)
+        From `flicker_times` [s].
+    rate : float
+        Sampling rate [Hz].
+    position : ndarray, shape (m,)
+        Where the processes are at the start; standard normal numbers at the very start.
+    endless : bool
+        The spectrum goes on above what `times` hold; what is faster than a sample is white noise to it.
+
+    Returns
+    -------
+    means : ndarray, shape (n,)
+    position : ndarray, shape (m,)
+    """
+    decay, weight, rest = _moments(times * rate)
+    variance = math.log(RATIO) / math.pi  # of each process
+    inner = rest.sum()
+    if endless:  # sum of 2 T over the correlation times that would follow; together they are white
+        inner += 2.0 * times[-1] * rate / (RATIO - 1.0)
+    total, last = ornstein_uhlenbeck(np.ascontiguousarray(normal[:, :-1]), decay, weight, position)
+    return math.sqrt(variance) * (total + math.sqrt(inner) * normal[:, -1]), last
+
+
+def sinusoid_means(index: NDArray[np.int64], frequency: float, rate: float, phase: float) -> Array:
+    """Means over the samples `index` of ``sin(2 pi f t + phase)``, for `frequency` and `rate` in Hz.
+
+    Examples
+    --------
+    >>> sinusoid_means(np.array([0, 1]), 1.0, 4.0, 0.0).round(4)  # quarters of a sine: 2/pi
+    array([0.6366, 0.6366])
+    """
+    cycles = frequency / rate
+    turn = np.remainder((index + 0.5) * cycles, 1.0)
+    return np.asarray(np.sinc(cycles) * np.sin(2.0 * math.pi * turn + phase))

@@ -1,0 +1,162 @@
+"""Channels of a simulated log, made from functions of time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.timegrid import time_coordinate
+from gyrostab.units import INNER, parse_unit
+from gyrostab.windows import duration_seconds
+
+__all__ = ["HELD", "channel", "check_points", "combine", "inner_unit", "piecewise", "stamp"]
+
+Array = NDArray[np.float64]
+#: Attribute of a channel whose values hold until the next one instead of running towards it.
+HELD = {"interpolation": "previous"}
+_EAGER = 2**20  # longer channels are computed chunk by chunk, when they are used
+
+
+def stamp(start: Any) -> int:
+    """Nanoseconds since 1970 of a time given as text, or as such a number."""
+    if isinstance(start, int | np.integer):
+        return int(start)
+    try:
+        time = pd.Timestamp(start)
+        return int((time.tz_convert(None) if time.tzinfo else time).as_unit("ns").value)
+    except (ValueError, TypeError) as error:
+        raise OptionError(f"start {start!r} is not a date and time; write for instance 2026-03-11T10:45:14") from error
+
+
+def inner_unit(unit: str, values: Any) -> tuple[str, Any]:
+    """The unit that a channel has inside, and its values in it; a unit that is not known is kept."""
+    if unit in INNER.values():
+        return unit, values
+    try:
+        known = parse_unit(unit)
+    except ValueError:
+        return unit, values
+    return INNER[known.quantity], np.asarray(values) * known.factor + known.offset
+
+
+def check_points(points: Any, where: str, columns: Sequence[str]) -> Array:
+    """Rows of numbers, the first of which is a time that does not fall."""
+    try:
+        table = np.asarray(points, dtype=np.float64)
+    except (ValueError, TypeError):
+        table = np.empty(0)
+    if table.ndim != 2 or table.shape[0] == 0 or table.shape[1] != len(columns) or not np.isfinite(table).all():
+        raise OptionError(f"{where}: {points!r} is not a list of [{', '.join(columns)}]; write for instance [{[0.0] * len(columns)}]")
+    if np.any(np.diff(table[:, 0]) < 0):
+        raise OptionError(f"{where}: the times {table[:, 0].tolist()} do not rise; sort them")
+    return table
+
+
+def piecewise(points: Array, *, held: bool) -> Callable[[Array], Array]:
+    """Function of time through `points` of (time, value): held from each to the next, or straight between them; held at the ends."""
+    times, values = points.T
+
+    def at(seconds: Array) -> Array:
+        if held:
+            return np.asarray(values[np.maximum(np.searchsorted(times, seconds, side="right") - 1, 0)])
+        return np.asarray(np.interp(seconds, times, values))
+
+    return at
+
+
+def channel(
+    name: str,
+    unit: str,
+    values: Callable[[Array], Array],
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    sensor_rate: float = 1.0,
+    attributes: Mapping[str, Any] | None = None,
+) -> xr.Dataset:
+    """Sample a function of the seconds since the start as a channel with its own time axis.
+
+    Parameters
+    ----------
+    name, unit : str
+        Name of the channel and its unit in memory (`gyrostab.units.INNER`).
+    values : callable
+        Seconds since the start -> values; called for stretches of time, in any order.
+    duration : str or float
+        Length of the channel; a number is in seconds.
+    start : str or int
+        First stamp, ISO 8601.
+    sensor_rate : float
+        Samples in a second [Hz].
+    attributes : mapping, optional
+        More attributes.
+
+    Returns
+    -------
+    xarray.Dataset
+        The channel on ``time_<name>``; lazy where it is long.
+
+    Examples
+    --------
+    >>> channel("supply_voltage", "V", lambda t: 28.0 - t / 3600, duration="1h").supply_voltage.sizes
+    Frozen({'time_supply_voltage': 3600})
+    """
+    if not (math.isfinite(sensor_rate) and sensor_rate > 0):
+        raise OptionError(f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number above 0, in Hz")
+    size = max(1, math.ceil(duration_seconds(duration, "duration") * sensor_rate - 1e-6))
+    dim = f"time_{name}"
+    attrs = {"units": unit, "long_name": name.replace("_", " "), **(attributes or {})}
+    coordinates = time_coordinate(stamp(start), sensor_rate, size, name=dim)
+    return xr.Dataset({name: (dim, _sampled(values, size, sensor_rate), attrs)}, coords=coordinates)
+
+
+def _sampled(values: Callable[[Array], Array], size: int, rate: float) -> Any:
+    def part(first: int, count: int) -> Array:
+        return np.asarray(values((first + np.arange(count)) / rate), dtype=np.float64)
+
+    if size <= _EAGER:
+        return part(0, size)
+    import dask
+    import dask.array as da
+
+    make = dask.delayed(part, pure=False)
+    spans = [(first, min(_EAGER, size - first)) for first in range(0, size, _EAGER)]
+    return da.concatenate([da.from_delayed(make(first, count), (count,), dtype=np.float64) for first, count in spans])
+
+
+def combine(*parts: xr.Dataset) -> xr.Dataset:
+    """Put environments together: channels side by side, tables of gaps one after the other.
+
+    Raises
+    ------
+    OptionError
+        When two of them have a channel of the same name.
+
+    Examples
+    --------
+    >>> from gyrostab.simulate.environment import steps
+    >>> warm = steps("temperature", "degC", [[0, 60]], duration="1h")
+    >>> sorted(combine(warm, steps("vibration", "g", [[0, 1]], duration="1h")).data_vars)
+    ['temperature', 'vibration']
+    """
+    names: list[Any] = []
+    rest, tables = [], []
+    for part in parts:
+        gaps = [name for name, variable in part.variables.items() if variable.dims == ("gap",)]
+        if gaps:
+            tables.append(part[gaps])
+        channels = part.drop_vars(gaps)
+        twice = [name for name in channels.data_vars if name in names]
+        if twice:
+            raise OptionError(f"the environment has the channel {twice[0]!r} twice; leave one out, or name it otherwise (channel = ...)")
+        names += list(channels.data_vars)
+        rest.append(channels)
+    table = [xr.concat(tables, dim="gap", data_vars="all").sortby("gap_start")] if tables else []
+    return xr.merge([*rest, *table], combine_attrs="drop_conflicts", join="exact", compat="no_conflicts")

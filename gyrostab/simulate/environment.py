@@ -1,0 +1,416 @@
+"""Environment of a simulated tool: channels that drive the effects, each a function that gives a Dataset.
+
+Times are seconds since the start of the log. ``PROFILES`` lists the functions and the units of their parameters for models.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.simulate.channels import HELD, channel, check_points, combine, inner_unit, piecewise
+from gyrostab.windows import duration_seconds
+
+__all__ = ["chamber", "light_power", "ramps", "rotation", "steps", "supply", "trip", "vibration"]
+
+Array = NDArray[np.float64]
+Points = Sequence[Sequence[float]]
+
+
+def _points(name: str, unit: str, points: Points, held: bool, duration: Any, start: Any, sensor_rate: float, **extra: Any) -> xr.Dataset:
+    table = check_points(points, f"points of {name}", ("time [s]", f"{name} [{unit}]"))
+    inner, table[:, 1] = inner_unit(unit, table[:, 1])
+    more = {**(HELD if held else {}), **extra}
+    function = piecewise(table, held=held)
+    return channel(name, inner, function, duration=duration, start=start, sensor_rate=sensor_rate, attributes=more)
+
+
+def steps(channel: str, unit: str, points: Points, *, duration: Any, start: Any = "1970-01-01", sensor_rate: float = 1.0) -> xr.Dataset:
+    """Any channel that jumps from value to value.
+
+    Parameters
+    ----------
+    channel, unit : str
+        Name and unit of the channel.
+    points : list of (time, value)
+        Each value [unit] holds from its time [s] to the next.
+    duration : str or float
+        Length of the log.
+    start : str
+        Time of its first sample.
+    sensor_rate : float
+        Samples of the channel in a second [Hz].
+
+    Examples
+    --------
+    >>> steps("pressure", "bar", [[0, 1], [2, 300]], duration=4.0).pressure.values
+    array([  100000.,   100000., 30000000., 30000000.])
+    """
+    return _points(channel, unit, points, True, duration, start, sensor_rate)
+
+
+def ramps(channel: str, unit: str, points: Points, *, duration: Any, start: Any = "1970-01-01", sensor_rate: float = 1.0) -> xr.Dataset:
+    """Any channel that runs straight from value to value; arguments as for `steps`.
+
+    Examples
+    --------
+    >>> ramps("temperature", "degC", [[0, 20], [4, 60]], duration=4.0).temperature.values
+    array([20., 30., 40., 50.])
+    """
+    return _points(channel, unit, points, False, duration, start, sensor_rate)
+
+
+def vibration(
+    points: Points, *, duration: Any, start: Any = "1970-01-01", sensor_rate: float = 1.0, band: Sequence[float] = (20.0, 2000.0)
+) -> xr.Dataset:
+    """Vibration as its rms acceleration, on and off or in steps, with a flat spectrum in a band.
+
+    Parameters
+    ----------
+    points : list of (time, rms)
+        Each rms acceleration [g] holds from its time [s] to the next. Wang et al. 2016: [[0, 0.02], [330, 13.39], [630, 0.02]].
+    band : (float, float)
+        Edges of the band [Hz]; Wang et al. 2016: up to 1 g^2/Hz at 700 to 800 Hz.
+    duration, start, sensor_rate
+        As for `steps`.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``vibration`` [g], with the attributes ``band_hz`` and ``interpolation``.
+
+    Examples
+    --------
+    >>> shaken = vibration([[0, 0.0], [1, 10.0]], duration=3.0, band=(700, 800)).vibration
+    >>> shaken.values, shaken.attrs["band_hz"]
+    (array([ 0., 10., 10.]), [700.0, 800.0])
+    """
+    low, high = (float(edge) for edge in band)
+    if not 0.0 <= low < high:
+        raise OptionError(f"band of vibration {list(band)}: give [lower, higher] frequency in Hz")
+    return _points("vibration", "g", points, True, duration, start, sensor_rate, band_hz=[low, high])
+
+
+def _lagged(values: Array, lag: float, sensor_rate: float) -> Array:
+    """First-order response to `values` (straight between the samples) with the time constant `lag` [s], from rest at the first."""
+    if lag <= 0.0:
+        return values
+    from scipy.signal import lfilter
+
+    a = 1.0 / (lag * sensor_rate)
+    keep = math.exp(-a)
+    new = 1.0 - -math.expm1(-a) / a  # weight of the new end of a straight piece
+    drive = new * values[1:] + (1.0 - keep - new) * values[:-1]
+    rest, _ = lfilter([1.0], [1.0, -keep], drive, zi=[keep * values[0]])
+    return np.concatenate([values[:1], rest])
+
+
+def chamber(
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    low: float = -40.0,
+    high: float = 60.0,
+    speed: float = 1.0,
+    hold: Any = 1800.0,
+    first: str = "low",
+    lag: Any = 0.0,
+    channel: str = "temperature",
+    sensor_rate: float = 1.0,
+) -> xr.Dataset:
+    """Temperature in a thermal chamber that goes up and down between two ends; by default the test of Li et al. 2013.
+
+    Parameters
+    ----------
+    low, high : float
+        Ends [degC].
+    speed : float
+        Rate of change between them [degC/min].
+    hold : str or float
+        Time at each end [s].
+    first : {"low", "high"}
+        End at which the test begins.
+    lag : str or float
+        Time constant by which the gyro follows the chamber [s]; 0 for at once.
+    channel : str
+        Name of the channel.
+    duration, start, sensor_rate
+        As for `steps`.
+
+    Examples
+    --------
+    >>> chamber(duration="190min").temperature[::1900].values.round(1)[:6]
+    array([-40. , -38.3,  -6.7,  25. ,  56.7,  60. ])
+    """
+    if not (low < high and speed > 0):
+        raise OptionError(f"chamber: give low below high and a speed above 0, not {low!r}, {high!r}, {speed!r}")
+    if first not in ("low", "high"):
+        raise OptionError(f"chamber: first is 'low' or 'high', not {first!r}")
+    seconds, wait = duration_seconds(duration, "duration"), _seconds(hold)
+    way = (high - low) / speed * 60.0
+    count = math.ceil(seconds / (wait + way)) + 1
+    begin = np.arange(count) * (wait + way)
+    ends = np.where(np.arange(count) % 2 == (first == "high"), low, high)
+    table = np.stack([np.stack([begin, begin + wait], axis=1).ravel(), np.repeat(ends, 2)], axis=1)
+    return _temperature(channel, lambda t: piecewise(table, held=False)(t), seconds, start, sensor_rate, _seconds(lag))
+
+
+def _seconds(value: Any) -> float:
+    return 0.0 if value == 0 else duration_seconds(value, "time")
+
+
+def _temperature(name: str, function: Any, seconds: float, start: Any, sensor_rate: float, lag: float) -> xr.Dataset:
+    size = max(1, math.ceil(seconds * sensor_rate - 1e-6))
+    felt = _lagged(function(np.arange(size) / sensor_rate), lag, sensor_rate)
+
+    def values(t: Array) -> Array:
+        return np.asarray(felt[np.rint(t * sensor_rate).astype(np.int64)])
+
+    return channel(name, "degree_Celsius", values, duration=seconds, start=start, sensor_rate=sensor_rate)
+
+
+def trip(
+    depths: Points,
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    surface: float = 15.0,
+    gradient: float = 30.0,
+    circulation: Points = (),
+    cooling: float = 0.4,
+    response: Any = 600.0,
+    channel: str = "temperature",
+    sensor_rate: float = 1.0,
+) -> xr.Dataset:
+    """Temperature of a tool that is run into a well, drills and comes out, and its depth.
+
+    The tool follows the mud around it with a time constant. Standing mud has the temperature of the rock, ``surface + gradient depth``;
+    mud that circulates comes from above and takes a share of that warmth away.
+
+    Parameters
+    ----------
+    depths : list of (time, depth)
+        Vertical depth [m], straight between the times [s]. A trip in goes at 300 to 600 m/h, drilling at 5 to 30 m/h.
+    surface : float
+        Temperature of the rock at the surface [degC].
+    gradient : float
+        Rise with depth [degC/km].
+    circulation : list of (from, to)
+        Times at which the pumps run [s].
+    cooling : float
+        Share of ``gradient depth`` that circulating mud takes away [1].
+    response : str or float
+        Time constant of the tool [s].
+    channel : str
+        Name of the temperature channel; the depth is ``depth`` [m].
+    duration, start, sensor_rate
+        As for `steps`.
+
+    Examples
+    --------
+    >>> down = trip([[0, 0], [7200, 1000]], duration="5h")
+    >>> down.temperature[[0, -1]].values.round(1), down.depth.values[-1]
+    (array([15., 45.]), np.float64(1000.0))
+    """
+    table = check_points(depths, "depths of trip", ("time [s]", "depth [m]"))
+    pumps = check_points(circulation, "circulation of trip", ("from [s]", "to [s]")) if len(circulation) else np.empty((0, 2))
+    depth = piecewise(table, held=False)
+
+    def mud(t: Array) -> Array:
+        warmth = gradient / 1000.0 * depth(t)
+        flows = np.zeros(t.shape, dtype=bool)
+        for begin, end in pumps:
+            flows |= (t >= begin) & (t < end)
+        return np.asarray(surface + warmth * np.where(flows, 1.0 - cooling, 1.0))
+
+    seconds = duration_seconds(duration, "duration")
+    warm = _temperature(channel, mud, seconds, start, sensor_rate, _seconds(response))
+    return combine(warm, _points("depth", "m", depths, False, seconds, start, sensor_rate))
+
+
+def _turn(table: Array, stick_slip: float, period: float) -> tuple[Any, Any]:
+    """Rate [deg/s] and angle [deg] of a shaft driven along `table` of (time, rate), with a torsional oscillation on top."""
+    times, rates = table.T
+    if times.size == 1:
+        times, rates = np.append(times, times + 1.0), np.repeat(rates, 2)
+    slope = np.diff(rates) / np.maximum(np.diff(times), 1e-9)
+    whole = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2.0 * np.diff(times))])
+    omega = 2.0 * math.pi / period
+
+    def pieces(t: Array) -> tuple[Array, NDArray[np.int64]]:
+        return np.clip(t, times[0], times[-1]), np.clip(np.searchsorted(times, t, side="right") - 1, 0, slope.size - 1)
+
+    def rate(t: Array) -> Array:
+        return np.asarray(np.interp(t, times, rates) * (1.0 - stick_slip * np.cos(omega * t)))
+
+    def swing(t: Array, base: Array, rise: Array) -> Array:  # integral of base(t) cos(omega t), base rising by `rise`
+        return np.asarray(base * np.sin(omega * t) / omega + rise * np.cos(omega * t) / omega**2)
+
+    # the oscillating part of the angle, up to the beginning of each piece
+    part = swing(times[1:], rates[1:], slope) - swing(times[:-1], rates[:-1], slope)
+    swung = np.concatenate([[0.0], np.cumsum(part)])
+
+    def angle(t: Array) -> Array:
+        inside, j = pieces(t)
+        base = rates[j] + slope[j] * (inside - times[j])
+        plain = whole[j] + (rates[j] + base) / 2.0 * (inside - times[j])
+        wave = swung[j] + swing(inside, base, slope[j]) - swing(times[j], rates[j], slope[j])
+        beyond = t - inside  # before the first and after the last point the drive holds its rate
+        edge = np.where(beyond < 0, rates[0], rates[-1])
+        wave = wave + edge * (np.sin(omega * t) - np.sin(omega * inside)) / omega
+        return np.asarray(plain + edge * beyond - stick_slip * wave)
+
+    return rate, angle
+
+
+def rotation(
+    points: Points,
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    stick_slip: float = 0.0,
+    period: Any = 4.0,
+    inclination: float = 30.0,
+    toolface: float = 0.0,
+    axis: str = "",
+    accelerations: bool = True,
+    sensor_rate: float = 100.0,
+) -> xr.Dataset:
+    """Rotation of the tool about its own axis, its toolface, and gravity in the frame that turns with it.
+
+    Parameters
+    ----------
+    points : list of (time, rate)
+        Rotation rate [deg/s], straight between the times [s]: one point for steady rotation, two for a ramp. 120 r/min are 720 deg/s.
+    stick_slip : float
+        Amplitude of the torsional oscillation as a share of the rate; at 1 the tool stands still once in a period [1].
+    period : str or float
+        Period of the oscillation [s]; 2 to 10 s in wells.
+    inclination : float
+        Angle of the tool's axis from the plumb line [deg].
+    toolface : float
+        Toolface at the start [deg].
+    axis : str
+        Gyro axis along the tool's axis, which feels this rotation; empty when the log shall not hold it.
+    accelerations : bool
+        Whether to give ``accel_x``, ``accel_y``, ``accel_z``.
+    sensor_rate : float
+        Samples of the channels in a second [Hz]; many in a turn.
+    duration, start
+        As for `steps`.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``rotation_rate`` [degree s-1], ``toolface`` [degree, 0 to 360], accelerations [g].
+
+    Examples
+    --------
+    >>> turning = rotation([[0, 360.0]], duration=1.0, sensor_rate=4.0, inclination=90.0)
+    >>> turning.toolface.values, turning.accel_x.values.round(3)
+    (array([  0.,  90., 180., 270.]), array([ 1.,  0., -1., -0.]))
+    """
+    table = check_points(points, "points of rotation", ("time [s]", "rate [deg/s]"))
+    if not 0.0 <= stick_slip <= 2.0:
+        raise OptionError(f"rotation: stick_slip {stick_slip!r} is outside of 0 to 2")
+    rate, angle = _turn(table, stick_slip, duration_seconds(period, "period"))
+    tilt = math.radians(inclination)
+
+    def face(t: Array) -> Array:
+        return np.asarray(np.radians(angle(t) + toolface))
+
+    made = {
+        "rotation_rate": ("degree s-1", rate, {"rotation_axis": axis} if axis else {}),
+        "toolface": ("degree", lambda t: np.remainder(angle(t) + toolface, 360.0), HELD),
+    }
+    if accelerations:
+        made |= {
+            "accel_x": ("g", lambda t: math.sin(tilt) * np.cos(face(t)), {}),
+            "accel_y": ("g", lambda t: -math.sin(tilt) * np.sin(face(t)), {}),
+            "accel_z": ("g", lambda t: np.full(t.shape, math.cos(tilt)), {}),
+        }
+    timing: dict[str, Any] = {"duration": duration, "start": start, "sensor_rate": sensor_rate}
+    return combine(*(channel(name, unit, values, attributes=more, **timing) for name, (unit, values, more) in made.items()))
+
+
+def supply(
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    full: float = 29.0,
+    empty: float = 22.0,
+    life: Any = 720_000.0,
+    loads: Points = (),
+    sensor_rate: float = 1.0,
+) -> xr.Dataset:
+    """Voltage of a battery that runs down, with loads that draw it lower.
+
+    Parameters
+    ----------
+    full, empty : float
+        Voltage without load at the beginning and at the end of its life [V]; flat first, falling fast at the end.
+    life : str or float
+        Life of the battery [s].
+    loads : list of (from, to, drop)
+        Times [s] at which another load is on, and the voltage that it takes [V].
+    duration, start, sensor_rate
+        As for `steps`.
+
+    Examples
+    --------
+    >>> supply(duration=4.0, life=4.0, loads=[[1, 2, 0.5]]).supply_voltage.values.round(2)
+    array([29.  , 28.28, 28.11, 26.68])
+    """
+    table = check_points(loads, "loads of supply", ("from [s]", "to [s]", "drop [V]")) if len(loads) else np.empty((0, 3))
+    end = duration_seconds(life, "life")
+
+    def voltage(t: Array) -> Array:
+        used = np.clip(t / end, 0.0, 1.0)
+        level = full - (full - empty) * (0.5 * used**2 + 0.5 * used**8)  # a plateau that sags, then the end
+        for begin, until, drop in table:
+            level = level - drop * ((t >= begin) & (t < until))
+        return np.asarray(level)
+
+    return channel("supply_voltage", "V", voltage, duration=duration, start=start, sensor_rate=sensor_rate)
+
+
+def light_power(
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    power: float = 1e-4,
+    loss: float = 1.0,
+    points: Points = (),
+    sensor_rate: float = 1.0,
+) -> xr.Dataset:
+    """Optical power at the detector, which falls as the source ages.
+
+    Parameters
+    ----------
+    power : float
+        Power at the start [W].
+    loss : float
+        Loss in a thousand hours [dB].
+    points : list of (time, loss)
+        More loss [dB], straight between the times [s]: heat, bends, radiation.
+    duration, start, sensor_rate
+        As for `steps`.
+
+    Examples
+    --------
+    >>> light_power(duration="1h", loss=0.0, points=[[0, 0], [3600, 3.0103]]).light_power[[0, 1800]].values.round(7)
+    array([1.00e-04, 7.07e-05])
+    """
+    table = check_points(points, "points of light_power", ("time [s]", "loss [dB]")) if len(points) else np.zeros((1, 2))
+    more = piecewise(table, held=False)
+
+    def level(t: Array) -> Array:
+        return np.asarray(power * 10.0 ** (-(loss * t / 3.6e6 + more(t)) / 10.0))
+
+    return channel("light_power", "W", level, duration=duration, start=start, sensor_rate=sensor_rate)

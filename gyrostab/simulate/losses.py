@@ -1,0 +1,148 @@
+"""Gaps of a simulated log: lost telemetry, lost power. Each function gives a table of gaps; times are seconds since the start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.schema import GAP_CAUSES
+from gyrostab.simulate.channels import check_points, stamp
+from gyrostab.simulate.noise import stream
+from gyrostab.windows import duration_seconds
+
+__all__ = ["gaps", "losses", "power_cuts"]
+
+Points = Sequence[Sequence[float]]
+_MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
+
+
+def _table(spans: NDArray[np.float64], cause: int, start: Any) -> xr.Dataset:
+    """Gaps from seconds; they are cut to samples when the log is made."""
+    edges = stamp(start) + np.rint(spans.reshape(-1, 2) * 1e9).astype(np.int64)
+    flags = {"flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8), "flag_meanings": " ".join(GAP_CAUSES)}
+    return xr.Dataset(
+        {
+            "gap_start": ("gap", edges[:, 0].view("datetime64[ns]"), {"long_name": "first missing sample"}),
+            "gap_end": ("gap", edges[:, 1].view("datetime64[ns]"), {"long_name": "first present sample after the gap"}),
+            "gap_cause": ("gap", np.full(len(edges), cause, np.int8), {"long_name": "cause of the gap", **flags}),
+        }
+    )
+
+
+def gaps(spans: Points, *, duration: Any = None, start: Any = "1970-01-01") -> xr.Dataset:
+    """Stretches of lost data at given times.
+
+    Parameters
+    ----------
+    spans : list of (from, to)
+        First missing instant and first one there again [s]; Wang et al. 2016: [[432, 450]].
+    start : str
+        Time of the first sample of the log.
+    duration
+        Not used; every function of the environment takes it.
+
+    Examples
+    --------
+    >>> gaps([[432, 450]]).gap_end.values
+    array(['1970-01-01T00:07:30.000000000'], dtype='datetime64[ns]')
+    """
+    table = check_points(spans, "spans of gaps", ("from [s]", "to [s]"))
+    if np.any(table[:, 1] <= table[:, 0]):
+        raise OptionError(f"spans of gaps: {table.tolist()}: each must end after it begins")
+    return _table(table, _MISSING, start)
+
+
+def losses(
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    seed: int = 0,
+    per_hour: float = 6.0,
+    mean: Any = 2.0,
+    bursts_per_hour: float = 0.5,
+    burst: Any = 120.0,
+    within: float = 20.0,
+) -> xr.Dataset:
+    """Data lost in mud-pulse telemetry: single frames now and then, and many in bursts while the channel is bad.
+
+    Parameters
+    ----------
+    duration : str or float
+        Length of the log.
+    start : str
+        Time of its first sample.
+    seed : int
+        Seed of the places.
+    per_hour : float
+        Losses in an hour of good reception [h-1].
+    mean : str or float
+        Mean length of a loss, exponentially distributed [s].
+    bursts_per_hour : float
+        Spells of bad reception in an hour [h-1].
+    burst : str or float
+        Mean length of such a spell, exponentially distributed [s].
+    within : float
+        How many times more losses there are in such a spell [1].
+
+    Examples
+    --------
+    >>> lost = losses(duration="200h", per_hour=6.0, bursts_per_hour=0.0, seed=1)
+    >>> bool(abs(lost.sizes["gap"] - 1200) < 120)
+    True
+    """
+    seconds, length, spell = (duration_seconds(value, "time") for value in (duration, mean, burst))
+    for name, value in {"per_hour": per_hour, "bursts_per_hour": bursts_per_hour, "within": within}.items():
+        if not value >= 0.0:
+            raise OptionError(f"losses: {name}={value!r} must not be below zero")
+    rng = stream(seed, "losses")
+    good = _poisson(rng, 0.0, seconds, per_hour)
+    bad = [
+        _poisson(rng, begin, begin + rng.exponential(spell), per_hour * max(0.0, within - 1.0))
+        for begin in _poisson(rng, 0.0, seconds, bursts_per_hour)
+    ]
+    begin = np.sort(np.concatenate([good, *bad]))
+    spans = np.stack([begin, begin + rng.exponential(length, begin.size)], axis=1)
+    return _table(spans, _MISSING, start)
+
+
+def _poisson(rng: np.random.Generator, begin: float, end: float, per_hour: float) -> NDArray[np.float64]:
+    return np.sort(rng.uniform(begin, end, rng.poisson(per_hour * (end - begin) / 3600.0)))
+
+
+def power_cuts(
+    cuts: Points = (),
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    seed: int = 0,
+    per_day: float = 0.0,
+    mean: Any = 60.0,
+) -> xr.Dataset:
+    """Losses of power: data is missing meanwhile, and the gyro starts anew afterwards (warm-up, bias jumps).
+
+    Parameters
+    ----------
+    cuts : list of (from, to)
+        Given times without power [s].
+    per_day : float
+        More of them at random, in a day [d-1].
+    mean : str or float
+        Mean length of those, exponentially distributed [s].
+    duration, start, seed
+        As for `losses`.
+
+    Examples
+    --------
+    >>> power_cuts([[100, 160]], duration="1h").gap_cause.values
+    array([6], dtype=int8)
+    """
+    table = check_points(cuts, "cuts of power_cuts", ("from [s]", "to [s]")) if len(cuts) else np.empty((0, 2))
+    rng = stream(seed, "power_cuts")
+    begin = _poisson(rng, 0.0, duration_seconds(duration, "duration"), per_day / 24.0)
+    more = np.stack([begin, begin + rng.exponential(duration_seconds(mean, "mean"), begin.size)], axis=1)
+    return _table(np.concatenate([table, more]), _RESTART, start)

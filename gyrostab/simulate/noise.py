@@ -1,0 +1,280 @@
+"""Noise of a gyro axis: Q, N, B, K, R of the noise table, and Gauss-Markov and sinusoidal parts.
+
+Every term of every axis has a stream of random numbers of its own, which depends on the seed, the axis and the term and on nothing else. So
+a term stays the same whatever the other terms, the effects, the length and the chunks are.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.kernels.stochastic import (
+    brownian_means,
+    flicker_means,
+    flicker_times,
+    ornstein_uhlenbeck_means,
+    sinusoid_means,
+)
+from gyrostab.noise import HOUR, TERMS, URAD_PER_S
+
+__all__ = ["FLICKER_LOW", "NoiseState", "Units", "begin_noise", "draw", "make_noise", "shape", "stream"]
+
+Array = NDArray[np.float64]
+#: Lowest frequency of flicker noise [Hz] unless a model says otherwise: flat within 0.2 % to averaging times of 20 h.
+FLICKER_LOW = 5e-9
+#: Samples of a block.
+CHUNK = 2**18
+
+
+def stream(seed: int, *names: str | int) -> np.random.Generator:
+    """Random numbers that belong to a seed and some names."""
+    return np.random.default_rng([seed, *(zlib.crc32(str(name).encode()) for name in names)])
+
+
+@dataclass
+class NoiseState:
+    """Where the random numbers of one axis are."""
+
+    rate: float
+    streams: dict[str, np.random.Generator]
+    times: Array
+    endless: bool
+    flicker: Array
+    angle: float = 0.0
+    walk: float = 0.0
+
+
+@dataclass(frozen=True)
+class Units:
+    """Fresh numbers of unit strength for a stretch of samples, before the level of the noise is known."""
+
+    first: int
+    size: int
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+def begin_noise(
+    seed: int, axis: str, *, rate: float, terms: str = "QNBK", flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf)
+) -> NoiseState:
+    """State of the noise of one axis before its first sample.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the simulation.
+    axis : str
+        Name of the axis.
+    rate : float
+        Sampling rate [Hz].
+    terms : str
+        Terms that will be asked for, of QNBK.
+    flicker_band : tuple of float
+        Lowest and highest frequency of B [Hz].
+    """
+    streams = {term: stream(seed, "noise", axis, term) for term in "QNBK" if term in terms}
+    low, high = flicker_band
+    if not 0.0 < low < high:
+        raise OptionError(
+            f"the band of flicker noise {low:g} to {high:g} Hz is empty; give the lower frequency, above 0, and the higher one"
+        )
+    times = flicker_times(rate, low=low, high=high)
+    position = streams["B"].standard_normal(64)[: times.size] if "B" in streams else np.zeros(times.size)
+    state = NoiseState(rate=rate, streams=streams, times=times, endless=math.isinf(high), flicker=position)
+    if "Q" in streams:
+        state.angle = float(_uniform(streams["Q"], 1)[0])
+    return state
+
+
+def _uniform(rng: np.random.Generator, size: int) -> Array:
+    """Rounding errors of unit variance."""
+    return math.sqrt(12.0) * (rng.random(size) - 0.5)
+
+
+def draw(state: NoiseState, first: int, size: int) -> tuple[Units, NoiseState]:
+    """Draw the numbers of the next `size` samples; `state` is left as it was."""
+    state = copy.deepcopy(state)
+    found: dict[str, Any] = {}
+    for term, rng in state.streams.items():
+        if term == "Q":
+            angle = np.concatenate([[state.angle], _uniform(rng, size)])
+            state.angle = float(angle[-1])
+            found[term] = angle
+        elif term == "N":
+            found[term] = rng.standard_normal(size)
+        elif term == "B":
+            normal = rng.standard_normal((size, state.times.size + 1))
+            found[term], state.flicker = flicker_means(normal, state.times, state.rate, state.flicker, endless=state.endless)
+        else:
+            found[term] = rng.standard_normal((size, 2))
+    return Units(first, size, found), state
+
+
+def shape(
+    units: Units, level: Mapping[str, Any], rate: float, carry: Mapping[str, float], *, ramp: float = 0.0
+) -> tuple[Array, dict[str, float]]:
+    """Give the numbers their level.
+
+    Parameters
+    ----------
+    units : Units
+        From `draw`.
+    level : mapping of str to float or ndarray, shape (n,)
+        Squared coefficients by symbol [unit of the noise table].
+    rate : float
+        Sampling rate [Hz].
+    carry : mapping
+        What the stretch before left behind; empty at the start.
+    ramp : float
+        R [deg/h^2]; zero at the first sample's start.
+
+    Returns
+    -------
+    rate : ndarray, shape (n,)
+        Rate [degree hour-1].
+    carry : dict
+        To be given to the next call.
+    """
+    total: Array = ramp * (units.first + 0.5 + np.arange(units.size)) / (HOUR * rate)
+    after = dict(carry)
+    for term, values in units.values.items():
+        strength = np.sqrt(np.broadcast_to(level[term], units.size))
+        if term == "Q":
+            angle = values * np.concatenate([[after.get("Q", strength[0])], strength])
+            after["Q"] = float(strength[-1])
+            total += np.diff(angle) * (URAD_PER_S * rate)
+        elif term == "N":
+            total += strength * math.sqrt(HOUR * rate) * values
+        elif term == "B":
+            total += strength * values
+        else:
+            steps, inner = values.T * (strength / math.sqrt(HOUR * rate))
+            walk, after["K"] = brownian_means(steps, inner, after.get("K", 0.0))
+            total += walk
+    return total, after
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What `make_noise` was asked for."""
+
+    rate: float
+    coefficients: Mapping[str, float]
+    markov: tuple[float, float] | None
+    sinusoid: tuple[float, float, float] | None
+
+
+def _more(parts: _Parts, state: tuple[Any, ...], first: int, size: int) -> tuple[Array, tuple[Any, ...]]:
+    """The next `size` samples."""
+    noise, carry, rng, position = copy.deepcopy(state)
+    units, noise = draw(noise, first, size)
+    level = {term: value**2 for term, value in parts.coefficients.items()}
+    total, carry = shape(units, level, parts.rate, carry, ramp=parts.coefficients.get("R", 0.0))
+    if parts.markov:
+        sigma, time = parts.markov
+        means, position = ornstein_uhlenbeck_means(rng.standard_normal((size, 2)), time * parts.rate, position)
+        total += sigma * means
+    if parts.sinusoid:
+        amplitude, frequency, phase = parts.sinusoid
+        total += amplitude * sinusoid_means(first + np.arange(size), frequency, parts.rate, phase)
+    return total, (noise, carry, rng, position)
+
+
+def make_noise(
+    *,
+    rate: float,
+    size: int,
+    seed: int = 0,
+    axis: str = "x",
+    Q: float = 0.0,
+    N: float = 0.0,
+    B: float = 0.0,
+    K: float = 0.0,
+    R: float = 0.0,
+    gauss_markov: tuple[float, float] | None = None,
+    sinusoid: tuple[float, float, float] | None = None,
+    flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf),
+    lazy: bool = False,
+    chunk: int = CHUNK,
+) -> Any:
+    """Make the noise of one gyro axis; each sample is the mean rate over its own interval.
+
+    The Allan variance is exactly that of the noise table at every averaging time: quantization noise is white in the angle, random walk and
+    Gauss-Markov noise are continuous processes averaged over each sample, flicker noise is a sum of such processes.
+
+    Parameters
+    ----------
+    rate : float
+        Sampling rate [Hz].
+    size : int
+        Number of samples.
+    seed : int
+        The same seed gives the same noise, whatever the chunks; more samples go on where fewer end.
+    axis : str
+        Name of the axis; each has its own noise.
+    Q, N, B, K, R : float
+        Coefficients [urad, deg/sqrt(h), deg/h, deg/h^1.5, deg/h^2]. R is the ramp R t.
+    gauss_markov : (float, float), optional
+        Standard deviation [deg/h] and correlation time [s].
+    sinusoid : (float, float, float), optional
+        Amplitude [deg/h], frequency [Hz] and phase [rad].
+    flicker_band : (float, float)
+        Lowest and highest frequency of B [Hz].
+    lazy : bool
+        Return a dask array, whose chunks are made one after the other.
+    chunk : int
+        Samples made at a time; the result does not depend on it.
+
+    Returns
+    -------
+    ndarray or dask array, shape (size,)
+        Rate [degree hour-1].
+
+    Raises
+    ------
+    OptionError
+        When a number makes no sense.
+
+    Examples
+    --------
+    >>> noise = make_noise(rate=100.0, size=100_000, N=0.01, seed=4)
+    >>> bool(abs(noise.std() - 60 * 0.01 * 10) < 0.1)  # 60 N sqrt(rate)
+    True
+    """
+    coefficients = {"Q": Q, "N": N, "B": B, "K": K, "R": R}
+    for name, value in {"rate": rate, "size": size, "chunk": chunk, **coefficients}.items():
+        least = 0.0 if name in TERMS else 1e-9
+        if not (math.isfinite(value) and (value >= least or name == "R")):
+            raise OptionError(f"{name}={value!r}: give a number {'from 0 up' if name in TERMS else 'above 0'}")
+    terms = "".join(term for term in "QNBK" if coefficients[term] > 0.0)
+    noise = begin_noise(seed, axis, rate=rate, terms=terms, flicker_band=flicker_band)
+    rng = stream(seed, "noise", axis, "gauss_markov")
+    state: tuple[Any, ...] = (noise, {}, rng, float(rng.standard_normal()))
+    parts = _Parts(rate, coefficients, gauss_markov, sinusoid)
+    spans = [(first, min(chunk, size - first)) for first in range(0, size, chunk)]
+    if lazy:
+        return _lazy(parts, state, spans)
+    values = np.empty(size)
+    for first, count in spans:
+        values[first : first + count], state = _more(parts, state, first, count)
+    return values
+
+
+def _lazy(parts: _Parts, state: Any, spans: list[tuple[int, int]]) -> Any:
+    import dask
+    import dask.array as da
+
+    step = dask.delayed(_more, pure=False, nout=2)
+    blocks = []
+    for first, count in spans:
+        values, state = step(parts, state, first, count)
+        blocks.append(da.from_delayed(values, (count,), dtype=np.float64))
+    return da.concatenate(blocks)
