@@ -45,6 +45,8 @@ class Reading:
         Another file with a channel (temperature, vibration ...) of the same time. Repeat for more.
     max_gap
         Longest gap; a longer step of the time stamps is taken for a step of the clock.
+    strict
+        Stop at a damaged or missing file instead of leaving a gap.
     """
 
     rate: Annotated[float | None, Parameter(metavar="HZ")] = None
@@ -55,6 +57,7 @@ class Reading:
     kind: Literal["rate", "angle"] | None = None
     channel: Annotated[list[Path] | None, Parameter(metavar="FILE", negative=())] = None
     max_gap: Annotated[str, Parameter(metavar="DURATION")] = "10D"
+    strict: Flag = False
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `gyrostab.run.load_log`."""
@@ -64,7 +67,7 @@ class Reading:
             "unit": _pairs(self.unit, "--unit"),
             "channel": tuple(self.channel or ()),
         }
-        return {name: value for name, value in chosen.items() if value not in (None, (), {})}
+        return {name: value for name, value in chosen.items() if value not in (None, (), {}) and value is not False}
 
 
 @Parameter(name="*", group=_WINDOWS)

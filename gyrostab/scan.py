@@ -79,7 +79,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.schema import log_channels, signal_name
 
     max_gap = reading.get("max_gap", "10D")
-    reading = {name: value for name, value in reading.items() if name != "max_gap"}
+    reading = {name: value for name, value in reading.items() if name not in ("max_gap", "on_file")}
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote

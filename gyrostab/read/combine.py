@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
+from gyrostab.join import some, together
 from gyrostab.read.buffers import park
 from gyrostab.read.overlap import drop_repeats
 from gyrostab.schema import SIGNAL_UNITS
@@ -106,11 +107,11 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
         data[channel] = ("row", _end_to_end(columns), {"units": units})
         absent[f"channel {channel}"] = [name for name, part in zip(names, parts, strict=True) if channel not in part]
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
-    gaps = [f"{what} is not in {_some(files)} and is missing there" for what, files in absent.items() if files]
+    gaps = [f"{what} is not in {some(files)} and is missing there" for what, files in absent.items() if files]
     joined.attrs.update(
         source_files=names,
         row_start=[int(start) for start in np.cumsum([0, *sizes[:-1]])],
-        notes=[*_notes(parts), *gaps],
+        notes=[*together((part.attrs["source_files"][0], part.attrs["notes"]) for part in parts), *gaps],
         unreadable_rows=sum(part.attrs["unreadable_rows"] for part in parts),
         unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
     )
@@ -146,20 +147,6 @@ def _dask() -> Any:
     return dask.array
 
 
-def _notes(parts: list[xr.Dataset]) -> list[str]:
-    """The notes of all files; what several files say alike is said once."""
-    said: dict[str, list[str]] = {}
-    for part in parts:
-        name = part.attrs["source_files"][0]
-        for note in part.attrs["notes"]:
-            said.setdefault(note.removeprefix(f"{name}: "), []).append(name)
-    return [f"{_some(names)}: {note}" for note, names in said.items()]
-
-
-def _some(names: list[str], most: int = 3) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
     """Add the channels of other files, each on its own ``time_<channel>`` with values only where present.
 
@@ -180,7 +167,7 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
             pieces.setdefault(channel, []).append((stamps, values, units))
     for channel, found in pieces.items():
         if len({units for _, _, units in found}) > 1:
-            raise UnitError(f"channel {channel!r} has different units in {_some(files)}; give one with --unit {channel}=UNIT")
+            raise UnitError(f"channel {channel!r} has different units in {some(files)}; give one with --unit {channel}=UNIT")
         stamps, values = (np.concatenate([piece[place] for piece in found]) for place in (0, 1))
         order = np.argsort(stamps, kind="stable")
         dim = f"time_{channel}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -14,13 +14,19 @@ from typing import Any, Protocol, cast
 import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
+from gyrostab.join import join_logs, log_span
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
+from gyrostab.read.lost import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
 from gyrostab.read.options import FileSummary, ReadOptions
+from gyrostab.read.overlap import stamp_span
 
-__all__ = ["Reader", "read_log", "readers", "scan_file"]
+__all__ = ["OnFile", "Reader", "read_log", "readers", "scan_file"]
 
 GROUP = "gyrostab.readers"
+
+#: Called with the number of a file, the number of files and the path.
+OnFile = Callable[[int, int, Path], None]
 
 
 class Reader(Protocol):
@@ -155,6 +161,9 @@ def read_log(
     unit: Mapping[str, str] | None = None,
     kind: str | None = None,
     channel: str | Path | Sequence[str | Path] = (),
+    strict: bool = False,
+    max_gap: str | float = "10D",
+    on_file: OnFile | None = None,
 ) -> xr.Dataset:
     r"""Read one log or many as they were written.
 
@@ -162,6 +171,7 @@ def read_log(
     ----------
     paths : path, pattern, or several of them
         Files are put in the order of their first stamps and joined; an axis or channel that one of them lacks is NaN there.
+        Either raw logs, or regular logs that gyrostab wrote, which become one regular log without being loaded.
     rate : float, optional
         Sampling rate [Hz] of files without a time column.
     start : str, optional
@@ -176,18 +186,26 @@ def read_log(
         How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` increments.
     channel : path or sequence of path, optional
         Files with further channels; each keeps its stamps as ``time_<channel>``.
+    strict : bool
+        Raise an error for a damaged or missing file. Otherwise one among several is left out with a note, and its time is a gap.
+    max_gap : str or float
+        Between regular logs, a longer step of time is taken as a step of the clock (raw logs: see `gyrostab.regularise`);
+        a number is in seconds.
+    on_file : callable, optional
+        Called with the number of the file (from 1), the number of files and the path before each file is read.
 
     Returns
     -------
     xarray.Dataset
         The raw log: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree], ``time(row)`` where the file has
         stamps (NaT where unreadable), channels, and the attributes ``kind``, ``source_files``, ``row_start``, ``notes``,
-        ``unreadable_rows``, ``unreadable_cells``. A regular log that gyrostab wrote is returned as that log, lazily.
+        ``unreadable_rows``, ``unreadable_cells``. Regular logs that gyrostab wrote are returned as one such log, lazily.
+        ``unreadable_files`` lists the files that were left out.
 
     Raises
     ------
     FormatError, UnitError, OptionError, TimeError
-        With the file, the place, what is wrong and what to do.
+        With the file, the place, what is wrong and what to do. `FormatError` also when more than half of the files cannot be read.
 
     Examples
     --------
@@ -201,35 +219,70 @@ def read_log(
     'log.csv: 1 of 3 rows are unreadable: line 3'
     """
     options = ReadOptions(
-        rate=rate, start=start, epoch=epoch, map=dict(map or {}), unit=dict(unit or {}), kind=kind, channel=cast(Any, channel)
+        rate=rate,
+        start=start,
+        epoch=epoch,
+        map=dict(map or {}),
+        unit=dict(unit or {}),
+        kind=kind,
+        channel=cast(Any, channel),
+        strict=strict,
     )
     found = expand(paths)
     extra = expand(options.channel) if options.channel else []
-    parts = _read_all(found, options)
-    logs = [path.name for path, part in zip(found, parts, strict=True) if "sampling_rate_hz" in part.attrs]
-    if logs and len(parts) > 1:
-        raise OptionError(f"{logs[0]} is a regular log already; join the source files instead, or process the logs one by one")
+    parts, lost = _read_all(found, options, on_file)
+    regular = [path for path, part in parts.items() if "sampling_rate_hz" in part.attrs]
+    if regular and len(regular) < len(parts):
+        raw = next(path for path in parts if path not in regular)
+        raise OptionError(
+            f"{regular[0].name} is a regular log already and {raw.name} is not; make a regular log of the latter and its like with "
+            "gyrostab ingest, and then join the regular logs"
+        )
     channels = [_read(path, replace(options, channels_only=True, start=None)) for path in extra]
-    if not logs:
-        _check_options([*parts, *channels])
-        parts = [concatenate(parts)]
+    spans = lost_spans(lost, _spans(parts), lambda path: scan_file(path, options)) if lost else {}
+    if regular:
+        log = join_logs([_check_regular(part, path.name, options) for path, part in parts.items()], regular, max_gap=max_gap)
     else:
-        parts = [_check_regular(parts[0], logs[0], options)]
-    return attach_channels(parts[0], channels)
+        _check_options([*parts.values(), *channels])
+        log = concatenate(list(parts.values()))
+        if lost and "time" not in log.variables:
+            raise FormatError(f"{lost[0].reason}; the files have no time stamps, so the time of those that follow it is not known: mend it")
+    return attach_channels(lost_attributes(log, lost, spans), channels)
 
 
-def _read_all(paths: Sequence[Path], options: ReadOptions) -> list[xr.Dataset]:
+def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None = None) -> tuple[dict[Path, xr.Dataset], list[LostFile]]:
     """Read the files one by one; what does not fit into memory together waits on disk."""
-    parts: list[xr.Dataset] = []
+    parts: dict[Path, xr.Dataset] = {}
+    lost: list[LostFile] = []
     held = 0
-    for path in paths:
-        part = _read(path, options)
+    for number, path in enumerate(paths, 1):
+        if on_file is not None:
+            on_file(number, len(paths), path)
+        try:
+            part = _read(path, options)
+        except (GyrostabError, OSError) as error:
+            if options.strict or len(paths) == 1 or not is_damage(path, error):
+                raise
+            lost.append(LostFile(path, reason_of(path, error)))
+            continue
         held += memory(part)
         if held > SPILL_BYTES and len(paths) > 1:
             held -= memory(part)
             part = to_disk(part)
-        parts.append(part)
-    return parts
+        parts[path] = part
+    check_share(lost, len(paths))
+    return parts, lost
+
+
+def _spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:
+    """First and last stamp [ns since 1970] of the files that have stamps."""
+    spans = {}
+    for path, part in parts.items():
+        if "sampling_rate_hz" in part.attrs:
+            spans[path] = log_span(part)
+        elif "time" in part.variables:
+            spans[path] = stamp_span(part)
+    return spans
 
 
 def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Dataset:

@@ -37,6 +37,8 @@ class ReadOptions:
         Files that hold further channels.
     channels_only : bool
         The file is read for its channels; gyro axes are not asked for.
+    strict : bool
+        A damaged place in a regular log is an error instead of a gap.
 
     Raises
     ------
@@ -57,6 +59,7 @@ class ReadOptions:
     kind: str | None = None
     channel: Sequence[str | Path] = ()
     channels_only: bool = False
+    strict: bool = False
 
     def __post_init__(self) -> None:
         if self.rate is not None and not (np.isfinite(self.rate) and self.rate > 0):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.read.stamps import NAT
 from gyrostab.schema import SIGNAL_UNITS
 
-__all__ = ["drop_repeats"]
+__all__ = ["drop_repeats", "stamp_span"]
 
 _BLOCK = 2**20
 _COMPARED = 2**15  # rows at each end of an overlap whose values are compared
@@ -38,7 +38,7 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     kept: list[xr.Dataset] = []
     ends: list[int] = []
     for part in parts:
-        first, end = _span(part)
+        first, end = stamp_span(part)
         for place in reversed(range(len(kept))):
             held = kept[place]
             if first > ends[place]:
@@ -51,7 +51,7 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
                 ends[place] = first - 1
             else:
                 part, kept[place] = _shorten(part, slice(head, None), held)
-                first, end = _span(part)
+                first, end = stamp_span(part)
         kept.append(part)
         ends.append(end)
         full = [place for place, one in enumerate(kept) if one.sizes["row"]]
@@ -77,8 +77,8 @@ def _stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
     return np.asarray(part["time"][max(begin, 0) : end].values).astype("datetime64[ns]").view(np.int64)
 
 
-def _span(part: xr.Dataset) -> tuple[int, int]:
-    """First and latest stamp."""
+def stamp_span(part: xr.Dataset) -> tuple[int, int]:
+    """First and latest stamp of a raw log [ns since 1970]."""
     first, latest = None, NAT
     for begin in range(0, part.sizes["row"], _BLOCK):
         stamps = _stamps(part, begin, begin + _BLOCK)

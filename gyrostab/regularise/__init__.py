@@ -14,8 +14,9 @@ import pandas as pd
 import xarray as xr
 
 from gyrostab.errors import OptionError, TimeError
+from gyrostab.gaps import gap_variables, name_lost
 from gyrostab.regularise.fill import gathered, on_grid
-from gyrostab.regularise.gaps import find_gaps, gap_table, gap_variables
+from gyrostab.regularise.gaps import find_gaps, gap_table
 from gyrostab.regularise.notes import describe, describe_channels, describe_rate
 from gyrostab.regularise.place import Placement, place_by_count, place_by_stamp, place_without_time
 from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_rate, odd_stretches
@@ -26,7 +27,7 @@ from gyrostab.timegrid import time_coordinate
 __all__ = ["gap_table", "regularise"]
 
 _DISAGREE = 0.02  # a declared rate further off than this is a mistake
-_OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "history")
+_OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "history", "unreadable_spans")
 
 
 def _seconds(max_gap: Any) -> float:
@@ -195,7 +196,7 @@ def regularise(
     found = survey(raw, name, block=block)
     notes: list[str] = []
     placement, hertz = _place(raw, found, _declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block, notes=notes)
-    table = find_gaps(placement, found)
+    table = name_lost(find_gaps(placement, found), raw.attrs.get("unreadable_spans", ()), placement.start, hertz)
     notes += describe(raw, found, placement, table, hertz)
 
     increments = raw.attrs.get("kind") == "increment"

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
+from gyrostab.gaps import CAUSE, FIRST, MOST_GAPS, thinned
 from gyrostab.kernels.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.regularise.fill import samples_of
 from gyrostab.regularise.place import Placement
 from gyrostab.regularise.survey import Survey
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.timegrid import grid_times
 
-__all__ = ["MOST_GAPS", "find_gaps", "gap_table", "gap_variables"]
-
-#: Rows of the table from which on neighbours of one cause are counted in one row.
-MOST_GAPS = 10_000
+__all__ = ["find_gaps", "gap_table"]
 
 _MISSING, _UNREADABLE, _OUTSIDE = (GAP_CAUSES.index(name) for name in ("missing", "unreadable", "outside_range"))
-# columns of the table while it is made
-_FIRST, _END, _SAMPLES, _ROWS, _CAUSE = range(5)
 
 
 def _holes(placement: Placement, found: Survey) -> NDArray[np.int64]:
@@ -68,24 +61,6 @@ def _dropped(events: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([sample, sample, np.zeros_like(count), count, rows[at, 0]], axis=1)
 
 
-def _thinned(table: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """At most about `most` lines: the nearest neighbours of one cause are counted together."""
-    if len(table) <= most:
-        return table
-    parts = []
-    for cause in np.unique(table[:, _CAUSE]):
-        part = table[table[:, _CAUSE] == cause]
-        room = max(1, int(most * len(part) / len(table)))
-        if len(part) > room and cause not in (STEP, RESTART):
-            distance = part[1:, _FIRST] - part[:-1, _END]
-            at = np.concatenate([[0], np.sort(np.argsort(distance, kind="stable")[len(distance) - room + 1 :]) + 1])
-            last = np.append(at[1:], len(part)) - 1
-            sums = np.add.reduceat(part[:, [_SAMPLES, _ROWS]], at, axis=0)
-            part = np.column_stack([part[at, _FIRST], part[last, _END], sums, part[at, _CAUSE]])
-        parts.append(part)
-    return np.concatenate(parts)
-
-
 def find_gaps(placement: Placement, found: Survey, *, most: int = MOST_GAPS) -> NDArray[np.int64]:
     """Make the table of gaps, in samples.
 
@@ -102,21 +77,8 @@ def find_gaps(placement: Placement, found: Survey, *, most: int = MOST_GAPS) -> 
             _dropped(placement.events),
         ]
     )
-    table = _thinned(table, most)
-    return table[np.lexsort((table[:, _CAUSE], table[:, _FIRST]))]
-
-
-def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str, Any]:
-    """Variables of the table of gaps, for a log that starts at `start` [ns] with `rate` [Hz]."""
-    flags = {"flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8), "flag_meanings": " ".join(GAP_CAUSES)}
-    first, end = (grid_times(start, rate, table[:, column]).view("datetime64[ns]") for column in (_FIRST, _END))
-    return {
-        "gap_start": ("gap", first, {"long_name": "first missing sample"}),
-        "gap_end": ("gap", end, {"long_name": "first present sample after the gap"}),
-        "gap_samples": ("gap", table[:, _SAMPLES], {"long_name": "samples missing", "units": "1"}),
-        "gap_rows": ("gap", table[:, _ROWS], {"long_name": "rows concerned", "units": "1"}),
-        "gap_cause": ("gap", table[:, _CAUSE].astype(np.int8), {"long_name": "cause of the gap", **flags}),
-    }
+    table = thinned(table, most)
+    return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
 
 
 def gap_table(log: xr.Dataset) -> pd.DataFrame:

@@ -6,30 +6,18 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.gaps import duration, stamp_text
 from gyrostab.kernels.stamps import DUPLICATE, OUT_OF_ORDER, RESTART
 from gyrostab.regularise.fill import samples_of
 from gyrostab.regularise.place import Placement
 from gyrostab.regularise.rate import RateEstimate
-from gyrostab.regularise.survey import Survey, file_of, stamp_text
+from gyrostab.regularise.survey import Survey, file_of
 from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.timegrid import grid_times
 
-__all__ = ["describe", "describe_channels", "describe_rate", "duration"]
+__all__ = ["describe", "describe_channels", "describe_rate"]
 
 _NAMED = 5  # of many events of one kind, so many are told one by one
-
-
-def duration(seconds: float) -> str:
-    """Write a duration as people say it.
-
-    Examples
-    --------
-    >>> duration(1068.0), duration(0.0045), duration(200 * 3600)
-    ('1068.0 s', '4.5 ms', '200.0 h')
-    """
-    if abs(seconds) < 1.0:
-        return f"{seconds * 1e3:.3g} ms"
-    return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def describe_channels(log: xr.Dataset) -> list[str]:

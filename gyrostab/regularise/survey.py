@@ -11,9 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.kernels.stamps import NO_STAMP
 
-__all__ = ["BLOCK", "Survey", "blocks", "file_of", "stamp_text", "survey"]
+__all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
 
 #: Rows that are held in memory at one time.
 BLOCK = 1 << 20
@@ -134,8 +133,3 @@ def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:
         return ", ".join(map(str, names)), row
     which = max(0, bisect_right(starts, row) - 1)
     return str(names[which]), row - starts[which]
-
-
-def stamp_text(stamp: int) -> str:
-    """Write a stamp [ns since 1970] as ISO 8601, to the millisecond."""
-    return "no stamp" if stamp == NO_STAMP else str(np.datetime64(int(stamp), "ns").astype("datetime64[ms]"))

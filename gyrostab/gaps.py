@@ -1,0 +1,107 @@
+"""The table of gaps of a log, by sample: its columns, its form as variables, and the words for times and durations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.schema import GAP_CAUSES
+from gyrostab.timegrid import grid_index, grid_times
+
+__all__ = [
+    "CAUSE",
+    "COLUMNS",
+    "END",
+    "FIRST",
+    "MOST_GAPS",
+    "ROWS",
+    "SAMPLES",
+    "duration",
+    "gap_variables",
+    "name_lost",
+    "stamp_text",
+    "thinned",
+]
+
+#: Rows of the table from which on neighbours of one cause are counted in one row.
+MOST_GAPS = 10_000
+
+#: Columns of the table: first missing sample, first present sample after, samples missing, rows concerned, cause.
+COLUMNS = FIRST, END, SAMPLES, ROWS, CAUSE = range(5)
+
+_MISSING, _UNREADABLE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("unreadable")
+_NEVER_THINNED = (GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart"))
+
+
+def duration(seconds: float) -> str:
+    """Write a duration as people say it.
+
+    Examples
+    --------
+    >>> duration(1068.0), duration(0.0045), duration(200 * 3600)
+    ('1068.0 s', '4.5 ms', '200.0 h')
+    """
+    if abs(seconds) < 1.0:
+        return f"{seconds * 1e3:.3g} ms"
+    return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def stamp_text(stamp: int) -> str:
+    """Write a stamp [ns since 1970] as ISO 8601, to the millisecond."""
+    return "no stamp" if stamp == np.iinfo(np.int64).min else str(np.datetime64(int(stamp), "ns").astype("datetime64[ms]"))
+
+
+def thinned(table: NDArray[np.int64], most: int = MOST_GAPS) -> NDArray[np.int64]:
+    """At most about `most` lines: the nearest neighbours of one cause are counted together."""
+    if len(table) <= most:
+        return table
+    parts = []
+    for cause in np.unique(table[:, CAUSE]):
+        part = table[table[:, CAUSE] == cause]
+        room = max(1, int(most * len(part) / len(table)))
+        if len(part) > room and cause not in _NEVER_THINNED:
+            distance = part[1:, FIRST] - part[:-1, END]
+            at = np.concatenate([[0], np.sort(np.argsort(distance, kind="stable")[len(distance) - room + 1 :]) + 1])
+            last = np.append(at[1:], len(part)) - 1
+            sums = np.add.reduceat(part[:, [SAMPLES, ROWS]], at, axis=0)
+            part = np.column_stack([part[at, FIRST], part[last, END], sums, part[at, CAUSE]])
+        parts.append(part)
+    return np.concatenate(parts)
+
+
+def name_lost(table: NDArray[np.int64], spans: Iterable[Iterable[int]], start: int, rate: float) -> NDArray[np.int64]:
+    """The table with the cause of those gaps changed to "unreadable" that files leave which could not be read.
+
+    Parameters
+    ----------
+    table : ndarray of int64, shape (n, 5)
+        Table of gaps.
+    spans : iterable of pairs of int
+        First and last instant [ns since 1970] of each lost file.
+    start, rate : int, float
+        First stamp [ns since 1970] and sampling rate [Hz] of the log.
+    """
+    table = table.copy()
+    for span in spans:
+        low, high = grid_index(start, rate, np.asarray(list(span)))
+        shared = np.minimum(table[:, END], high) - np.maximum(table[:, FIRST], low)
+        length = table[:, END] - table[:, FIRST]
+        belongs = (table[:, CAUSE] == _MISSING) & (shared > 0) & (shared >= 0.5 * np.minimum(length, high - low))
+        table[belongs, CAUSE] = _UNREADABLE
+    return table
+
+
+def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str, Any]:
+    """Variables of the table of gaps, for a log that starts at `start` [ns] with `rate` [Hz]."""
+    flags = {"flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8), "flag_meanings": " ".join(GAP_CAUSES)}
+    first, end = (grid_times(start, rate, table[:, column]).view("datetime64[ns]") for column in (FIRST, END))
+    return {
+        "gap_start": ("gap", first, {"long_name": "first missing sample"}),
+        "gap_end": ("gap", end, {"long_name": "first present sample after the gap"}),
+        "gap_samples": ("gap", table[:, SAMPLES], {"long_name": "samples missing", "units": "1"}),
+        "gap_rows": ("gap", table[:, ROWS], {"long_name": "rows concerned", "units": "1"}),
+        "gap_cause": ("gap", table[:, CAUSE].astype(np.int8), {"long_name": "cause of the gap", **flags}),
+    }

@@ -1,0 +1,172 @@
+"""Many regular logs to one lazy regular log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyrostab.errors import OptionError, TimeError, UnitError
+from gyrostab.gaps import gap_variables
+from gyrostab.join.channels import join_channels
+from gyrostab.join.gaps import join_gaps
+from gyrostab.join.grid import Piece, Source, log_span, source_of
+from gyrostab.join.lazy import chunk_of, lay
+from gyrostab.join.notes import some, together
+from gyrostab.join.place import place_logs
+from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
+from gyrostab.timegrid import grid_times, time_coordinate
+
+__all__ = ["join_logs", "log_span"]
+
+#: What the clocks of two loggers, or of one that is now hot and now cold, may differ by; more is another rate.
+RATE_TOLERANCE = 1e-4
+
+_PACKING = ("dtype", "scale_factor", "add_offset")
+
+
+def join_logs(logs: Sequence[xr.Dataset], paths: Sequence[str | Path], *, max_gap: str | float = "10D") -> xr.Dataset:
+    """Join regular logs along time, lazily.
+
+    Parameters
+    ----------
+    logs : sequence of xarray.Dataset
+        Regular logs, in any order, overlapping or with gaps between them: ``rate(axis, time)`` [degree hour-1] or
+        ``angle(axis, time)`` [degree], channels, tables of gaps.
+    paths : sequence of path
+        Their files, for messages.
+    max_gap : str or float
+        A longer pause is a step of the clock, and the log that follows comes after one missing sample; a number is in seconds.
+
+    Returns
+    -------
+    xarray.Dataset
+        One regular log on the grid of the first: a sample of another log takes the nearest sample of the grid. Of samples that two
+        logs have, that of the earlier counts, where it is not NaN. Axes and channels that a log lacks are NaN there. The table of gaps
+        holds those of the logs and those between them. The signal is one dask task for each chunk.
+
+    Raises
+    ------
+    TimeError
+        When the sampling rates differ by more than 100 parts per million.
+    UnitError
+        When the logs hold different kinds of signal, or a channel has different units.
+
+    Examples
+    --------
+    >>> from gyrostab.log import make_log
+    >>> first, second = (make_log(np.full(4, float(n)), rate=1.0, unit="deg/h", start=f"2026-01-01T00:00:0{6 * n}") for n in range(2))
+    >>> join_logs([second, first], ["b.nc", "a.nc"]).rate.values
+    array([[ 0.,  0.,  0.,  0., nan, nan,  1.,  1.,  1.,  1.]])
+    """
+    if len(logs) == 1:
+        return logs[0]
+    for log in logs:
+        check_log(log)
+    sources = sorted((source_of(log, Path(path).name) for log, path in zip(logs, paths, strict=True)), key=lambda source: source.start)
+    _check_same(sources)
+    pieces, notes = place_logs(sources, max_gap=_seconds(max_gap))
+    rate = sources[0].rate
+    start = int(grid_times(sources[0].start, rate, -pieces[0].first))
+    size = max(piece.end for piece in pieces)
+    name = signal_name(sources[0].log)
+    chunk = chunk_of([source.log[name].data for source in sources])
+    axes = sorted({str(axis) for source in sources for axis in source.log["axis"].values})
+    signal = xr.Variable(
+        ("axis", "time"), lay([_parts(pieces, name, axis) for axis in axes], size, chunk), _signal_attributes(sources, name)
+    )
+    signal.encoding = _packing(sources, name)
+    channels, stamps = join_channels(pieces, start, rate, size, chunk)
+    coordinates = xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps}).merge(time_coordinate(start, rate, size)).coords
+    variables = {name: signal, **channels, **gap_variables(join_gaps(pieces), start, rate)}
+    joined = xr.Dataset(variables, coordinates, _attributes(sources, size, [*notes, *_absent(sources, axes)]))
+    joined.set_close(partial(_close, logs))
+    return joined
+
+
+def _close(logs: Sequence[xr.Dataset]) -> None:
+    for log in logs:
+        log.close()
+
+
+def _seconds(max_gap: str | float) -> float:
+    try:
+        seconds = float(max_gap) if isinstance(max_gap, int | float) else pd.Timedelta(max_gap).total_seconds()
+    except ValueError as error:
+        raise OptionError(f"max_gap={max_gap!r} is not a duration; write for instance '10D', '2h' or '30min'") from error
+    if not seconds > 0:
+        raise OptionError(f"max_gap={max_gap!r} must be longer than nothing; write for instance '10D', '2h' or '30min'")
+    return seconds
+
+
+def _check_same(sources: Sequence[Source]) -> None:
+    """Refuse logs of another kind or another sampling rate than the first."""
+    first = sources[0]
+    kind = signal_name(first.log)
+    for source in sources[1:]:
+        other = signal_name(source.log)
+        if other != kind:
+            raise UnitError(f"{first.name} holds a gyro signal of kind {kind!r}, {source.name} of kind {other!r}; run them one by one")
+        if abs(source.rate / first.rate - 1) > RATE_TOLERANCE:
+            raise TimeError(
+                f"{first.name} is a log of {first.rate:.10g} Hz and {source.name} one of {source.rate:.10g} Hz; one log has one sampling "
+                "rate: run them one by one, or ingest their source files together"
+            )
+
+
+def _parts(pieces: Sequence[Piece], name: str, axis: str) -> list[Any]:
+    found = []
+    for piece in pieces:
+        rows = [str(label) for label in piece.source.log["axis"].values]
+        if axis in rows:
+            found.append((piece.source.log[name].data, rows.index(axis), piece.runs))
+    return found
+
+
+def _signal_attributes(sources: Sequence[Source], name: str) -> dict[str, Any]:
+    return {**sources[0].log[name].attrs, "units": SIGNAL_UNITS[name]}
+
+
+def _packing(sources: Sequence[Source], name: str) -> dict[str, Any]:
+    """How integers of the source are stored, where all logs agree on it."""
+    found = [{key: source.log[name].encoding.get(key) for key in _PACKING} for source in sources]
+    alike = all(one == found[0] for one in found) and found[0]["scale_factor"] is not None
+    return {key: value for key, value in found[0].items() if value is not None} if alike else {}
+
+
+def _absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
+    """Sentences on axes and channels that some of the logs lack."""
+    names = {f"axis {axis}": [s.name for s in sources if axis not in s.log["axis"].values] for axis in axes}
+    for channel in dict.fromkeys(name for source in sources for name in log_channels(source.log)):
+        names[f"channel {channel}"] = [source.name for source in sources if channel not in source.log]
+    return [f"{what} is not in {some(files)} and is missing there" for what, files in names.items() if files]
+
+
+def _attributes(sources: Sequence[Source], size: int, notes: Sequence[str]) -> dict[str, Any]:
+    first = sources[0].log.attrs
+    kept = {key: value for key, value in first.items() if all(_equal(source.log.attrs.get(key), value) for source in sources)}
+    files = [[names] if isinstance(names := source.log.attrs.get("source_files", []), str) else list(names) for source in sources]
+    said = [[note] if isinstance(note := source.log.attrs.get("notes", []), str) else list(note) for source in sources]
+    labels = [names[0] if len(names) == 1 else source.name for names, source in zip(files, sources, strict=True)]
+    now = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
+    done = f"{now} gyrostab.read_log: {len(sources)} regular logs on {size} samples at {sources[0].rate:.10g} Hz"
+    lost = [name for source in sources for name in source.log.attrs.get("unreadable_files", [])]
+    return {
+        **kept,
+        "kind": signal_name(sources[0].log),
+        "sampling_rate_hz": sources[0].rate,
+        "source_files": list(dict.fromkeys(name for names in files for name in names)),
+        "history": "\n".join(filter(None, [first.get("history"), done])),
+        "notes": [*together(zip(labels, said, strict=True)), *notes],
+        **({"unreadable_files": lost} if lost else {}),
+    }
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return type(one) is type(other) and bool(np.all(one == other))

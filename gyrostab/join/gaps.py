@@ -1,0 +1,98 @@
+"""One table of gaps from those of several logs on one grid: what is missing in all that could have it, and what lies between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.gaps import CAUSE, END, FIRST, SAMPLES, thinned
+from gyrostab.join.grid import Piece
+from gyrostab.schema import GAP_CAUSES
+from gyrostab.timegrid import grid_index
+
+__all__ = ["join_gaps"]
+
+Table = NDArray[np.int64]
+
+_MISSING, _DUPLICATE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("duplicate")
+_NONE: Table = np.empty((0, 5), dtype=np.int64)
+_FAR = np.iinfo(np.int64).max // 2
+
+
+def _own_gaps(piece: Piece) -> Table:
+    """The table of one log, on the common grid."""
+    log, source = piece.source.log, piece.source
+    table = _NONE
+    if "gap_start" in log.variables and log.sizes["gap"]:
+        ends = (log[name].values.astype("datetime64[ns]").view(np.int64) for name in ("gap_start", "gap_end"))
+        first, end = (piece.on_grid(np.rint(grid_index(source.start, source.rate, stamps)).astype(np.int64)) for stamps in ends)
+        samples = log["gap_samples"].values.astype(np.int64)
+        rows = log["gap_rows"].values.astype(np.int64) if "gap_rows" in log.variables else np.zeros_like(samples)
+        table = np.stack([first, end, samples, rows, log["gap_cause"].values.astype(np.int64)], axis=1)
+    return np.concatenate([table, _slips(piece)]) if len(piece.runs) > 1 else table
+
+
+def _slips(piece: Piece) -> Table:
+    """Samples left empty, or left out, where a slightly different rate has drifted by one sample."""
+    end, own_end = piece.runs[:-1, 0] + piece.runs[:-1, 2], piece.runs[:-1, 1] + piece.runs[:-1, 2]
+    start, own = piece.runs[1:, 0], piece.runs[1:, 1]
+    cause = np.where(start > end, _MISSING, _DUPLICATE)
+    return np.stack([end, start, start - end, own - own_end, cause], axis=1)
+
+
+def _clip(table: Table, low: int, high: int) -> Table:
+    """The lines, or parts of lines, from sample `low` to `high`."""
+    first, end = np.maximum(table[:, FIRST], low), np.minimum(table[:, END], high)
+    event = table[:, FIRST] == table[:, END]
+    kept = np.where(event, (table[:, FIRST] >= low) & (table[:, FIRST] < high), end > first)
+    out = table[kept].copy()
+    cut = (end - first)[kept] < out[:, END] - out[:, FIRST]
+    out[:, FIRST], out[:, END] = np.where(event, table[:, FIRST], first)[kept], np.where(event, table[:, END], end)[kept]
+    out[cut, SAMPLES] = np.minimum(out[:, SAMPLES], out[:, END] - out[:, FIRST])[cut]
+    return out
+
+
+def _both(held: Table, new: Table) -> Table:
+    """What is missing in both of two logs, with the cause that the first of them gives; its events stay."""
+    lines = [held[held[:, FIRST] == held[:, END]]]
+    lines += [_clip(held[held[:, END] > held[:, FIRST]], int(first), int(end)) for first, end in new[:, [FIRST, END]] if end > first]
+    return np.concatenate(lines)
+
+
+def join_gaps(pieces: Sequence[Piece]) -> Table:
+    """The table of gaps of the joined log.
+
+    Parameters
+    ----------
+    pieces : sequence of Piece
+        In the order in which they were placed.
+
+    Returns
+    -------
+    ndarray of int64, shape (n, 5)
+        Columns of `gyrostab.gaps.COLUMNS`, sorted by sample.
+    """
+    tables: list[Table] = []
+    firsts: list[int] = []
+    ends: list[int] = []
+    end = pieces[0].first
+    for piece in pieces:
+        new = _own_gaps(piece)
+        tables.append(new)
+        if piece.first > end:
+            cause = piece.cause if piece.cause >= 0 else _MISSING
+            tables[-1] = np.concatenate([[[end, piece.first, piece.first - end, 0, cause]], new])
+        stop = min(piece.end, end)
+        if piece.first < stop:
+            for place in np.flatnonzero((np.array(ends) > piece.first) & (np.array(firsts) < stop)):
+                held = tables[place]
+                inside = _both(_clip(held, piece.first, stop), _clip(new, piece.first, stop))
+                tables[place] = np.concatenate([_clip(held, -_FAR, piece.first), inside, _clip(held, stop, _FAR)])
+            tables[-1] = np.concatenate([_clip(new, -_FAR, piece.first), _clip(new, stop, _FAR)])
+        firsts.append(min(piece.first, end))
+        ends.append(piece.end)
+        end = max(end, piece.end)
+    table = thinned(np.concatenate([*tables, _NONE]))
+    return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]

@@ -1,0 +1,126 @@
+"""One log among several: its samples, and the samples of the common grid that they take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.schema import signal_name
+from gyrostab.timegrid import TimeGridIndex, first_stamp, grid_times
+
+__all__ = ["Piece", "Source", "log_span", "runs_of", "source_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A regular log as it was opened: name of the file, first stamp [ns since 1970], sampling rate [Hz], samples."""
+
+    name: str
+    log: xr.Dataset
+    start: int
+    rate: float
+    size: int
+
+    @property
+    def end(self) -> int:
+        """Stamp of the last sample [ns since 1970]."""
+        return int(grid_times(self.start, self.rate, self.size - 1))
+
+    def values(self, begin: int, end: int) -> NDArray[np.float64]:
+        """The signal from sample `begin` to `end` (axis, sample), NaN beyond the ends of the log."""
+        out = np.full((self.log.sizes["axis"], end - begin), np.nan)
+        low, high = max(begin, 0), min(end, self.size)
+        if low < high:
+            out[:, low - begin : high - begin] = self.log[signal_name(self.log)].data[:, low:high]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A log on the common grid.
+
+    Attributes
+    ----------
+    source : Source
+        The log.
+    runs : ndarray of int64, shape (n, 3)
+        First sample of the grid, first sample of the log, length; more than one where the log's rate differs from the grid's.
+    off : float
+        How far its samples lie from the grid's [samples].
+    clock : tuple of int
+        A stamp of its clock [ns since 1970] and the sample of the grid that has it.
+    cause : int
+        Cause (number in schema.GAP_CAUSES) of the gap before it; -1 when the stamps tell the gap.
+    """
+
+    source: Source
+    runs: NDArray[np.int64]
+    off: float
+    clock: tuple[int, int]
+    cause: int = -1
+
+    @property
+    def first(self) -> int:
+        """First sample of the grid."""
+        return int(self.runs[0, 0])
+
+    @property
+    def end(self) -> int:
+        """Sample of the grid after the last."""
+        return int(self.runs[-1, 0] + self.runs[-1, 2])
+
+    def on_grid(self, samples: Any) -> NDArray[np.int64]:
+        """Samples of the grid that samples of the log take; beyond the ends of the log as if it went on."""
+        samples = np.asarray(samples, dtype=np.int64)
+        which = np.clip(np.searchsorted(self.runs[:, 1], samples, side="right") - 1, 0, len(self.runs) - 1)
+        return np.asarray(self.runs[which, 0] + samples - self.runs[which, 1])
+
+
+def source_of(log: xr.Dataset, name: str) -> Source:
+    """Take the first stamp, rate and size of a regular log."""
+    index = log.xindexes.get("time")
+    if isinstance(index, TimeGridIndex):
+        return Source(name, log, index.start, index.rate, log.sizes["time"])
+    return Source(name, log, first_stamp(log), float(log.attrs["sampling_rate_hz"]), log.sizes["time"])
+
+
+def log_span(log: xr.Dataset) -> tuple[int, int]:
+    """First and last stamp of a regular log [ns since 1970]."""
+    source = source_of(log, "")
+    return source.start, source.end
+
+
+def runs_of(first: int, off: float, size: int, ratio: float) -> NDArray[np.int64]:
+    """Runs of a log whose sample n lies at ``first + off + n * ratio`` of the grid, each at the nearest sample.
+
+    Where the log is faster than the grid (ratio < 1) a sample is left out now and then; where it is slower a sample of the grid stays
+    empty.
+
+    Examples
+    --------
+    >>> runs_of(10, 0.25, 8, 1.1).tolist()  # sample 3 lies at 13.55, sample 4 at 14.65
+    [[10, 0, 3], [14, 3, 5]]
+    """
+    if ratio == 1.0 or size == 1:
+        return np.array([[first, 0, size]], dtype=np.int64)
+
+    def shift(n: Any) -> Any:
+        return np.rint(off + n * (ratio - 1.0)).astype(np.int64)
+
+    steps = np.arange(1, abs(int(shift(np.int64(size - 1)) - shift(np.int64(0)))) + 1)
+    way = 1 if ratio > 1.0 else -1
+    at = np.ceil((shift(np.int64(0)) + way * (steps - 0.5) - off) / (ratio - 1.0)).astype(np.int64)
+    at = np.clip(at, 1, size - 1)
+    at += shift(at) != shift(np.int64(0)) + way * steps  # a tie that rounds to the even side
+    begin = np.concatenate([[0], at])
+    begin = np.unique(begin[begin < size])
+    end = np.append(begin[1:], size)
+    if way < 0:
+        begin[1:] += 1  # its sample of the grid is taken
+    kept = end > begin
+    begin, end = begin[kept], end[kept]
+    return np.stack([first + begin + shift(begin), begin, end - begin], axis=1)

@@ -1,0 +1,119 @@
+"""Samples of several arrays on one grid as a dask array: a task for each chunk, none of which holds more than its own samples."""
+
+from __future__ import annotations
+
+import uuid
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Part", "chunk_of", "lay"]
+
+#: An array (time), or (axis, time) with the row to take, and its runs: first sample of the grid, first of the array, length.
+Part = tuple[Any, int | None, NDArray[np.int64]]
+
+_LEAST_CHUNK, _MOST_CHUNK = 2**16, 2**22
+
+
+def chunk_of(arrays: Sequence[Any]) -> int:
+    """Samples of a chunk: as most chunks of the arrays have them, within reason."""
+    lengths = Counter(length for array in arrays for length in getattr(array, "chunks", [[array.shape[-1]]])[-1][:1])
+    return int(np.clip(lengths.most_common(1)[0][0], _LEAST_CHUNK, _MOST_CHUNK))
+
+
+def _filled(size: int, lead: int, blocks: list[Any], spec: NDArray[np.int64]) -> NDArray[np.float64]:
+    """One chunk: each line of `spec` puts a stretch of a block in its place; what an earlier line has put there stays."""
+    out = np.full(size, np.nan)
+    for which, row, begin, at, length, shared in spec.tolist():
+        block = np.asarray(blocks[which])
+        values = (block if row < 0 else block[row])[begin : begin + length]
+        if shared:
+            here = out[at : at + length]
+            np.copyto(here, values, where=np.isnan(here))
+        else:
+            out[at : at + length] = values
+    return out.reshape((1,) * lead + (size,))
+
+
+class _Row:
+    """Where the samples of one row of an array lie: keys of its blocks, and the runs cut at the edges of blocks."""
+
+    def __init__(self, part: Part):
+        import dask.array as da
+
+        array, row, runs = part
+        self.array = array if isinstance(array, da.Array) else da.from_array(array, chunks=(*(1,) * (array.ndim - 1), _MOST_CHUNK))
+        self.edges = np.concatenate([[0], np.cumsum(self.array.chunks[-1])])
+        self.row = -1
+        self.lead: tuple[int, ...] = ()
+        if row is not None:
+            above = np.concatenate([[0], np.cumsum(self.array.chunks[0])])
+            block = bisect_right(above.tolist(), row) - 1
+            self.row, self.lead = row - int(above[block]), (block,)
+        self.runs = runs
+        self.first, self.end = int(runs[0, 0]), int(runs[-1, 0] + runs[-1, 2])
+
+    def stretches(self, begin: int, end: int) -> list[tuple[tuple[Any, ...], int, int, int]]:
+        """Of the samples of the grid from `begin` to `end`: key of the block, first sample in it, first of the grid, length."""
+        found = []
+        low = np.searchsorted(self.runs[:, 0] + self.runs[:, 2], begin, side="right")
+        high = np.searchsorted(self.runs[:, 0], end, side="left")
+        for sample, own, length in self.runs[low:high].tolist():
+            a, b = max(sample, begin), min(sample + length, end)
+            at = own + a - sample
+            while a < b:
+                block = bisect_right(self.edges, at) - 1
+                n = min(b - a, int(self.edges[block + 1]) - at)
+                found.append(((self.array.name, *self.lead, block), at - int(self.edges[block]), a, n))
+                a, at = a + n, at + n
+        return found
+
+
+def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = False) -> Any:
+    """Put arrays on one grid, float64, NaN where none has a sample; where two have one, the first of them that is not NaN counts.
+
+    Parameters
+    ----------
+    rows : sequence of sequence of Part
+        For each row of the result, the arrays that have samples of it, the one that counts first in front.
+    size : int
+        Samples of the grid.
+    chunk : int
+        Samples of a chunk of the result.
+    flat : bool
+        The result has no rows: one dimension.
+
+    Returns
+    -------
+    dask.array.Array, shape (len(rows), size) or (size,)
+        Its graph has one task for each chunk, beside the tasks of the arrays.
+    """
+    import dask.array as da
+    from dask.highlevelgraph import HighLevelGraph
+
+    name, lead = f"gyrostab-join-{uuid.uuid4().hex}", 0 if flat else 1
+    lengths = tuple(min(chunk, size - begin) for begin in range(0, size, chunk))
+    layer: dict[Any, Any] = {}
+    sources: dict[str, Any] = {}
+    for number, parts in enumerate(rows):
+        placed = [_Row(part) for part in parts]
+        sources.update({one.array.name: one.array for one in placed})
+        first = np.array([one.first for one in placed], dtype=np.int64)
+        end = np.array([one.end for one in placed], dtype=np.int64)
+        for place, length in enumerate(lengths):
+            begin = place * chunk
+            keys: dict[Any, int] = {}
+            spec: list[tuple[int, ...]] = []
+            for which in np.flatnonzero((first < begin + length) & (end > begin)):
+                for key, at, sample, n in placed[which].stretches(begin, begin + length):
+                    shared = any(sample - begin < s[3] + s[4] and s[3] < sample - begin + n for s in spec)
+                    spec.append((keys.setdefault(key, len(keys)), placed[which].row, at, sample - begin, n, int(shared)))
+            task = (_filled, length, lead, list(keys), np.array(spec, dtype=np.int64).reshape(-1, 6))
+            layer[(name, place) if flat else (name, number, place)] = task
+    graph = HighLevelGraph.from_collections(name, layer, dependencies=list(sources.values()))
+    chunks = (lengths,) if flat else ((1,) * len(rows), lengths)
+    return da.Array(graph, name, chunks, dtype=np.float64)
