@@ -13,7 +13,7 @@ import pandas as pd
 import xarray as xr
 
 from gyrostab.errors import OptionError, TimeError, UnitError
-from gyrostab.gaps import gap_variables
+from gyrostab.gaps import gap_variables, name_lost
 from gyrostab.join.channels import join_channels
 from gyrostab.join.gaps import join_gaps
 from gyrostab.join.grid import Piece, Source, log_span, source_of
@@ -31,7 +31,9 @@ RATE_TOLERANCE = 1e-4
 _PACKING = ("dtype", "scale_factor", "add_offset")
 
 
-def join_logs(logs: Sequence[xr.Dataset], paths: Sequence[str | Path], *, max_gap: str | float = "10D") -> xr.Dataset:
+def join_logs(
+    logs: Sequence[xr.Dataset], paths: Sequence[str | Path], *, max_gap: str | float = "10D", lost: Sequence[tuple[int, int]] = ()
+) -> xr.Dataset:
     """Join regular logs along time, lazily.
 
     Parameters
@@ -43,6 +45,8 @@ def join_logs(logs: Sequence[xr.Dataset], paths: Sequence[str | Path], *, max_ga
         Their files, for messages.
     max_gap : str or float
         A longer pause is a step of the clock, and the log that follows comes after one missing sample; a number is in seconds.
+    lost : sequence of (int, int)
+        First and last instant [ns since 1970] of files that cannot be read; the gaps there are of the cause "unreadable".
 
     Returns
     -------
@@ -84,7 +88,7 @@ def join_logs(logs: Sequence[xr.Dataset], paths: Sequence[str | Path], *, max_ga
     signal.encoding = _packing(sources, name)
     channels, stamps = join_channels(pieces, start, rate, size, chunk)
     coordinates = xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps}).merge(time_coordinate(start, rate, size)).coords
-    variables = {name: signal, **channels, **gap_variables(join_gaps(pieces), start, rate)}
+    variables = {name: signal, **channels, **gap_variables(name_lost(join_gaps(pieces), lost, start, rate), start, rate)}
     joined = xr.Dataset(variables, coordinates, _attributes(sources, size, [*notes, *_absent(sources, axes)]))
     joined.set_close(partial(_close, logs))
     return joined

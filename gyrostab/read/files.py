@@ -241,12 +241,16 @@ def read_log(
     channels = [_read(path, replace(options, channels_only=True, start=None)) for path in extra]
     spans = lost_spans(lost, _spans(parts), lambda path: scan_file(path, options)) if lost else {}
     if regular:
-        log = join_logs([_check_regular(part, path.name, options) for path, part in parts.items()], regular, max_gap=max_gap)
+        log = join_logs(
+            [_check_regular(part, path.name, options) for path, part in parts.items()], regular, max_gap=max_gap, lost=list(spans.values())
+        )
     else:
         _check_options([*parts.values(), *channels])
         log = concatenate(list(parts.values()))
         if lost and "time" not in log.variables:
             raise FormatError(f"{lost[0].reason}; the files have no time stamps, so the time of those that follow it is not known: mend it")
+        if spans:
+            log.attrs["unreadable_spans"] = [list(span) for span in spans.values()]  # where regularise will find the gaps
     return attach_channels(lost_attributes(log, lost, spans), channels)
 
 

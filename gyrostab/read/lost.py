@@ -127,7 +127,7 @@ def _ns(stamp: np.datetime64) -> int:
 
 
 def lost_attributes(log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Path, Span]) -> xr.Dataset:
-    """The log with notes on the lost files, their names (``unreadable_files``) and their time (``unreadable_spans``, [ns])."""
+    """The log with notes on the lost files, and their names in ``unreadable_files``."""
     if not lost:
         return log
     notes = []
@@ -140,6 +140,5 @@ def lost_attributes(log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Pa
     before = log.attrs.get("notes", [])
     return log.assign_attrs(
         notes=[*([before] if isinstance(before, str) else before), *notes],
-        unreadable_files=[one.path.name for one in lost],
-        unreadable_spans=[list(span) for span in spans.values()],
+        unreadable_files=[*log.attrs.get("unreadable_files", []), *(one.path.name for one in lost)],
     )
