@@ -161,17 +161,10 @@ def run(
     reading: Mapping[str, Any] | None = None,
     windows: Mapping[str, Any] | None = None,
     fitting: Mapping[str, Any] | None = None,
-    surface_only: bool = False,
     overwrite: bool = False,
-    resume: bool = False,
-    scheduler: str = "threads",
-    workers: int | None = None,
     stage: Stage = no_stage,
 ) -> Path:
-    """Make the product of some logs and write it as NetCDF, without holding the log in memory, and so that it can be continued.
-
-    The work is done in parts, and each finished part is kept in the folder ``.PRODUCT.nc.job`` beside the output until
-    the product is complete. A run that was stopped, or killed, is continued with `resume`; its product is the same, bit for bit.
+    """Make the product of some logs and write it as NetCDF, without holding the log in memory.
 
     Parameters
     ----------
@@ -181,52 +174,41 @@ def run(
         NetCDF file to be written.
     reading, windows, fitting : mapping
         Options of `gyrostab.read.read_log`, `gyrostab.davar.davar` and `gyrostab.fit.fit_noise`.
-    surface_only : bool
-        Write the dynamic Allan variance without fitting it.
     overwrite : bool
-        Whether an existing output may be replaced, and an unfinished run of it forgotten.
-    resume : bool
-        Continue an unfinished run of the same inputs and options; begin where there is none; do nothing when the product is complete.
-    scheduler : str
-        ``threads``, ``processes``, or the address of a dask.distributed scheduler, whose workers must see the same files.
-    workers : int, optional
-        Threads or processes; one for each core by default.
+        Whether an existing output may be replaced.
     stage : callable
-        Told the name of each stage as it begins, how much is to be done in it, and how much is done.
+        Told the name of each stage as it begins, and its number of samples.
 
     Returns
     -------
     Path
         The file written.
-
-    Raises
-    ------
-    ResumeError
-        When an unfinished run is in the way, cannot be continued as asked, or is being worked on by another process.
-    WorkerError
-        When the workers cannot do the work.
-    OutputError, OptionError, FormatError
-        For an output, an option or an input that is wrong; the message says whether finished parts are kept.
-    KeyboardInterrupt
-        When interrupted; its message says how much is done.
     """
-    reading, windows, fitting = dict(reading or {}), dict(windows or {}), None if surface_only else dict(fitting or {})
-    scheduler = check_scheduler(scheduler)
-    target = check_output(output, suffixes=[".nc"], overwrite=True, inputs=paths)
-    check_windows(**windows)
-    files = expand([*paths, *reading.get("channel", ())])
-    fingerprint = make_fingerprint(files, {**reading, "channel": None, **windows, **(fitting or {}), "surface_only": surface_only or None})
-    folder = folder_of(target)
-    blocks: Blocks = {}
-    with hold(folder):
-        try:
-            begun = _begun(target, folder, fingerprint, resume=resume, overwrite=overwrite)
-            if begun == "complete":
-                warnings.warn(f"{target} is complete already", stacklevel=2)
-            else:
-                remove_leftovers(target)
-                log = load_log(paths, **reading)
-                _continue(log, target, folder, fingerprint, blocks, reading=reading, paths=paths, windows=windows, fitting=fitting, ...)
-        finally:
-            ...
+    from gyrostab.davar import davar
+    from gyrostab.export import to_netcdf
+    from gyrostab.fit import fit_noise
+
+    target = check_output(output, suffixes=[".nc"], overwrite=overwrite, inputs=paths)
+    check_windows(**(windows or {}))
+    stage("reading", 0)
+    log = load_log(paths, **(reading or {}))
+    stage("computing", samples_of(log))
+    surface = davar(log, **(windows or {}))
+    to_netcdf(fit_noise(surface, **(fitting or {})), target, overwrite=overwrite)
+    stage("checking", 0)
+    _note_constant(target)
     return target
+
+
+def _note_constant(path: Path) -> None:
+    """Warn of windows in which an axis never moved: the Allan variance is zero at the shortest and the longest tau."""
+    from gyrostab.export import open_product
+
+    with open_product(path) as product:
+        still = (product["avar"].isel(tau=[0, -1]) == 0.0).all("tau").compute()
+    for axis in still["axis"].values:
+        share = float(still.sel(axis=axis).mean())
+        if share > 0.0:
+            warnings.warn(
+                f"gyro axis {axis} is constant in {share:.0%} of the windows: is the sensor stuck, or its column a filler?", stacklevel=2
+            )
