@@ -263,6 +263,8 @@ class Effect:
         Channels that drive it -> the unit they must have (`gyrostab.units.INNER`).
     size_parameters : tuple of str
         Parameters that switch the effect off when all of them are zero.
+    terms : str
+        For the stage "noise": symbols that it may change, of QNBK; all of them when it does not say.
     references : tuple of str
         Where the equation and the sizes come from.
 
@@ -279,6 +281,7 @@ class Effect:
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {}
     size_parameters: ClassVar[tuple[str, ...]] = ()
+    terms: ClassVar[str] = "QNBK"
     references: ClassVar[tuple[str, ...]] = ()
 
     axes: tuple[str, ...] = ()
