@@ -46,7 +46,7 @@ class Parameter:
     choices : tuple of str
         Allowed words, for a parameter that is a word.
     many : bool
-        One number for each of the effect's axes instead of one number.
+        One number for each of the effect's axes, or one for all of them; see `Effect.each`.
     source : str
         Where the typical size comes from: author and year, or "estimate".
     """
@@ -297,8 +297,8 @@ class Effect:
             needs = ", ".join(self.channels) or "no channel"
             raise OptionError(f"effect {self.name!r}: driver names {len(self.driver)} channels; it takes {needs}, in this order")
         for known in self.parameters():
-            if known.many and self.axes and len(getattr(self, known.name)) != len(self.axes):
-                raise OptionError(f"effect {self.name!r}, parameter {known.name!r}: give one number for each of the axes {list(self.axes)}")
+            if known.many and self.axes:
+                self.each(known.name, self.axes)
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
@@ -327,6 +327,22 @@ class Effect:
     def channel_names(self) -> dict[str, str]:
         """Channel of `channels` -> its name in the log."""
         return dict(zip(self.channels, self.driver or self.channels, strict=True))
+
+    def each(self, name: str, axes: tuple[str, ...]) -> Array:
+        """A parameter that is one number for each axis: one number given stands for all, none for zeros.
+
+        Raises
+        ------
+        OptionError
+            When the numbers do not fit the axes.
+        """
+        numbers = np.asarray(getattr(self, name), dtype=np.float64)
+        if numbers.size not in (0, 1, len(axes)):
+            given = f"{numbers.size} numbers for {len(axes)} axes"
+            raise OptionError(
+                f"effect {self.name!r}, parameter {name!r}: {given}; give one number for each of the axes {list(axes)}, or one for all"
+            )
+        return np.array(np.broadcast_to(numbers if numbers.size else 0.0, len(axes)))
 
     # ------------------------------------------------------------------------------------------------------- three faces
 
