@@ -16,13 +16,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from gyrostab.errors import SchemaError
+from gyrostab.errors import FormatError, SchemaError
 from gyrostab.schema import check_log, check_product, check_surface
-from gyrostab.timegrid import TimeGridIndex, grid_times, period_ns, time_coordinate
+from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import ON_DISK, on_disk
 
-__all__ = ["from_disk", "to_disk"]
+__all__ = ["PACKING", "declared_grids", "decode_stamps", "from_disk", "index_dim", "to_disk"]
 
 CONVENTIONS = "CF-1.11, ACDD-1.3"
 TITLES = {
@@ -33,10 +34,12 @@ TITLES = {
 }
 #: Dimensions in the order of the file; those not named keep their place between `tau` and `time`.
 _ORDER = ("axis", "term", "tau")
-_CHUNK = 2**17  # values in one compressed chunk: 1 MiB of float64
+#: Attribute with the rule of a computed time axis, on the variable that holds its first stamp.
+GRID = "sampling_grid"
 _EPOCH = "1970-01-01T00:00:00"
 _CALENDAR = {"calendar": "proleptic_gregorian", "units_metadata": "leap_seconds: none"}
-_PACKING = ("dtype", "scale_factor", "add_offset")  # of integer counts, where the reader declares them
+#: What the encoding of integer counts consists of, where a reader declares them.
+PACKING = ("dtype", "scale_factor", "add_offset")
 _JSON_NAMES = "json_attributes"
 
 # Names that UDUNITS reads as we mean them. A whole power may follow; a broken one is misread without a word, so it never passes.
@@ -55,28 +58,33 @@ def _kind(dataset: xr.Dataset) -> str:
 def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
     """Lay a dataset out as the file shall hold it; `verb` goes to its history."""
     kind = _kind(dataset)
-    divisor = 1000 if _whole_microseconds(dataset) else 1
+    grids = _grids(dataset, kind)
+    divisor = 1000 if _whole_microseconds(dataset, grids) else 1
+    since = {"units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}", **_CALENDAR}
     bounds = [str(variable.attrs["bounds"]) for variable in dataset.variables.values() if "bounds" in variable.attrs]
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
+        if name in grids:
+            variables[f"{name}_start"] = _first_stamp(grids[name], variable.attrs, divisor, since)
+            continue
         stored = _lazy(variable).transpose(*_disk_order(variable.dims)) if name not in dataset.dims else variable
         attrs = _attributes_to_disk({"long_name": str(name).replace("_", " "), **variable.attrs})
         data = stored.data if name not in dataset.dims else None
         if variable.dtype.kind == "M":
-            data, grid = _stamps(dataset, name, stored, divisor)
-            attrs = {**attrs, **grid}
+            data = _stamps(name, stored, divisor)
             if name in dataset.dims:
                 attrs = {"standard_name": "time", "axis": "T", **attrs}
             if name not in bounds:
-                attrs |= {"units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}", **_CALENDAR}
+                attrs |= since
         elif data is None:
             data = variable.values
         packing = (
-            {key: variable.encoding[key] for key in _PACKING if key in variable.encoding} if "scale_factor" in variable.encoding else {}
+            {key: variable.encoding[key] for key in PACKING if key in variable.encoding} if "scale_factor" in variable.encoding else {}
         )
         variables[name] = xr.Variable(stored.dims, data, {} if name in bounds else attrs, packing)
-    coords = {name: variables.pop(name) for name in list(dataset.coords) if name not in bounds}
+    coords = {name: variables.pop(name) for name in list(dataset.coords) if name not in bounds and name in variables}
     stored_set = xr.Dataset(variables, coords=xr.Coordinates(coords, indexes={}))
+    stored_set = stored_set.rename_dims({dim: index_dim(dim) for dim in grids if dim in stored_set.dims})
     if "avar" in variables:
         beside = [name for name in ("count", "coverage", "edf", "estimator") if name in variables]
         stored_set["avar"].attrs["ancillary_variables"] = " ".join(beside)
@@ -94,41 +102,61 @@ def _lazy(variable: xr.Variable) -> xr.Variable:
     return variable if variable._in_memory or variable.chunks is not None else variable.chunk("auto")
 
 
-def _whole_microseconds(dataset: xr.Dataset) -> bool:
-    """Whether microseconds hold every time exactly; nanoseconds always do, but fewer programs read them."""
+def _grids(dataset: xr.Dataset, kind: str) -> dict[Any, Any]:
+    """The rules of the time axes that are computed, or of a log that might as well be."""
+    grids = {name: index.transform for name, index in dataset.xindexes.items() if isinstance(index, TimeGridIndex)}
+    if kind == "log" and "time" not in grids:
+        stamps, rate = _nanoseconds(dataset["time"].values), float(dataset.attrs["sampling_rate_hz"])
+        if np.array_equal(stamps, grid_times(int(stamps[0]), rate, np.arange(stamps.size))):
+            grids["time"] = time_coordinate(int(stamps[0]), rate, stamps.size).xindexes["time"].transform  # type: ignore[attr-defined]
+    taken = [other for name in grids for other in (f"{name}_start", index_dim(name)) if other in dataset.variables]
+    if taken:
+        raise SchemaError(f"the name {taken[0]!r} is needed for the time axis; rename that variable")
+    return grids
+
+
+def index_dim(dim: Any) -> str:
+    """Name in the file of a dimension whose stamps are computed: CF lets none be called ``time`` that has no stamps."""
+    return f"{dim}_index"
+
+
+def _first_stamp(grid: Any, attrs: dict[Any, Any], divisor: int, since: dict[str, Any]) -> xr.Variable:
+    """What stands in the file for a computed time axis: its first stamp, with the rate and the exact rule as attributes."""
+    (dim,) = grid.dims
+    rule = {"dim": dim, "start_ns": grid.start, "rate_hz": grid.rate, "first": grid.first, "stride": grid.stride, "size": grid.size}
+    first = int(grid_times(grid.start, grid.rate, grid.first))
+    said = {
+        "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
+        "comment": f"sample n (from 0) is at this time + n / sampling_rate_hz; {GRID} is the exact rule: "
+        "start_ns + round((first + stride * n) * 1e9 / rate_hz) nanoseconds since 1970",
+        "sampling_rate_hz": grid.rate / grid.stride,
+        GRID: json.dumps(rule),
+        **({"axis_attributes": json.dumps(dict(attrs), default=str)} if attrs else {}),
+    }
+    return xr.Variable((), np.int64(first // divisor), {**said, **since})
+
+
+def _whole_microseconds(dataset: xr.Dataset, grids: dict[Any, Any]) -> bool:
+    """Whether microseconds hold every time in the file exactly; nanoseconds always do, but fewer programs read them."""
     for name, variable in dataset.variables.items():
-        index = dataset.xindexes.get(name)
-        if isinstance(index, TimeGridIndex):
-            whole, fraction = period_ns(index.transform.rate)
-            if fraction or whole % 1000 or index.transform.start % 1000:
+        if name in grids:
+            if int(grid_times(grids[name].start, grids[name].rate, grids[name].first)) % 1000:
                 return False
         elif variable.dtype.kind == "M" and np.any(_nanoseconds(variable.values) % 1000):
             return False
     return True
 
 
-def _nanoseconds(stamps: Any) -> np.ndarray[Any, np.dtype[np.int64]]:
+def _nanoseconds(stamps: Any) -> NDArray[np.int64]:
     return np.asarray(stamps).astype("datetime64[ns]").view(np.int64)
 
 
-def _stamps(dataset: xr.Dataset, name: Any, variable: xr.Variable, divisor: int) -> tuple[Any, dict[str, Any]]:
-    """Whole microseconds or nanoseconds since 1970; for a computed time axis, the rule that makes it too."""
-    import dask.array as da
-
-    index = dataset.xindexes.get(name)
-    if not isinstance(index, TimeGridIndex):
-        stamps = variable.values
-        if np.isnat(stamps).any():
-            raise SchemaError(f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); every time must be known")
-        return _nanoseconds(stamps) // divisor, {}
-    grid = index.transform
-    rule = {"start_ns": grid.start, "rate_hz": grid.rate, "first": grid.first, "stride": grid.stride}
-
-    def count(position: Any) -> Any:
-        return grid_times(grid.start, grid.rate, grid.first + grid.stride * position) // divisor
-
-    positions = da.arange(grid.size, chunks=_CHUNK, dtype=np.int64)
-    return positions.map_blocks(count, dtype=np.int64), {"sampling_grid": json.dumps(rule)}
+def _stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.int64]:
+    """Whole microseconds or nanoseconds since 1970."""
+    stamps = variable.values
+    if np.isnat(stamps).any():
+        raise SchemaError(f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); every time must be known")
+    return _nanoseconds(stamps) // divisor
 
 
 def _attributes_to_disk(attrs: dict[str, Any]) -> dict[str, Any]:
@@ -178,18 +206,18 @@ def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, A
     return _attributes_to_disk(given)
 
 
-def from_disk(stored: xr.Dataset) -> xr.Dataset:
-    """Turn what was opened without decoding times and without indexes into the dataset it was in memory."""
+def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
+    """Turn what was opened without decoding times and without indexes into the dataset it was in memory; `where` is for messages."""
     bounds = {variable.attrs["bounds"]: name for name, variable in stored.variables.items() if "bounds" in variable.attrs}
     variables: dict[Any, xr.Variable] = {}
-    grids: dict[str, xr.Coordinates] = {}
+    grids = declared_grids(stored)
+    axes, close = _axes(stored, grids, where), stored.close
+    stored = stored.rename_dims({index_dim(rule["dim"]): rule["dim"] for rule in grids.values() if index_dim(rule["dim"]) in stored.dims})
     for name, variable in stored.variables.items():
-        grid = _sampling_grid(str(name), variable)
-        if grid is not None:
-            grids[str(name)] = grid
+        if name in grids:
             continue
         parent = stored.variables[bounds[name]] if name in bounds else variable
-        opened = _decode_time(variable, parent.attrs)
+        opened = decode_stamps(variable, parent.attrs)
         if opened.dtype.kind in "OT":
             opened = opened.astype(str)
         if name in stored.coords or name in bounds:
@@ -198,13 +226,11 @@ def from_disk(stored: xr.Dataset) -> xr.Dataset:
         variables[name] = opened.transpose(*_memory_order(opened.dims))
     names = [name for name in variables if name in stored.coords or name in bounds]
     dataset = xr.Dataset(variables).set_coords(names)
-    for name, grid in grids.items():
-        attrs = _attributes_from_disk(dict(stored.variables[name].attrs))
-        attrs.pop("sampling_grid")
-        dataset = dataset.assign_coords(grid)
-        dataset[name].attrs = attrs
+    for name, axis in axes.items():
+        dataset = dataset.assign_coords(axis)
+        dataset[grids[name]["dim"]].attrs = json.loads(stored.variables[name].attrs.get("axis_attributes", "{}"))
     dataset.attrs = _attributes_from_disk(dict(stored.attrs))
-    dataset.set_close(stored.close)
+    dataset.set_close(close)
     return dataset
 
 
@@ -212,7 +238,9 @@ def _memory_order(dims: tuple[Any, ...]) -> list[Any]:
     return [*(dim for dim in dims if dim not in ("tau", "term", "bnds")), *(dim for dim in ("tau", "term", "bnds") if dim in dims)]
 
 
-def _decode_time(variable: xr.Variable, attrs: dict[Any, Any]) -> xr.Variable:
+def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) -> xr.Variable:
+    """Times as datetime64[ns], by the units in `attrs` or in the variable's own; a variable without such units as it is."""
+    attrs = variable.attrs if attrs is None else attrs
     if " since " not in str(attrs.get("units", "")):
         return variable
     timed = variable.copy(deep=False)
@@ -221,16 +249,24 @@ def _decode_time(variable: xr.Variable, attrs: dict[Any, Any]) -> xr.Variable:
     return decoded.astype("datetime64[ns]")
 
 
-def _sampling_grid(name: str, variable: xr.Variable) -> xr.Coordinates | None:
-    """Rebuild the computed time axis that a file declares, if its size and its first and last stamps agree with the declaration."""
-    if "sampling_grid" not in variable.attrs or not variable.size:
-        return None
-    rule = json.loads(variable.attrs["sampling_grid"])
-    first, stride, size = rule["first"], rule["stride"], variable.size
-    whole = xr.Dataset(coords=time_coordinate(rule["start_ns"], rule["rate_hz"], first + stride * (size - 1) + 1, name=name))
-    axis = whole.isel({name: slice(first, None, stride)})
-    ends = _decode_time(variable[[0, -1]], dict(variable.attrs)).values
-    return axis.coords if np.array_equal(axis[name][[0, -1]].values, ends) else None
+def declared_grids(stored: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """The rules of the computed time axes that a file declares: name of the variable -> rule."""
+    return {str(name): json.loads(variable.attrs[GRID]) for name, variable in stored.variables.items() if GRID in variable.attrs}
+
+
+def _axes(stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str) -> dict[str, xr.Coordinates]:
+    """The computed time axes: name of the variable that declares one -> coordinate."""
+    axes = {}
+    for name, rule in grids.items():
+        dim = rule["dim"]
+        size = stored.sizes.get(index_dim(dim), 0)
+        if size != rule["size"]:
+            raise FormatError(
+                f"{where}: has {size} samples on {index_dim(dim)!r}, but was written with {rule['size']}: some other program has cut it, "
+                "and its times are lost; cut it in Python with gyrostab.open_log(...).isel or .sel, and write it with gyrostab.to_netcdf"
+            )
+        axes[name] = time_coordinate(rule["start_ns"], rule["rate_hz"], size, name=dim, first=rule["first"], stride=rule["stride"])
+    return axes
 
 
 def _attributes_from_disk(attrs: dict[str, Any]) -> dict[str, Any]:

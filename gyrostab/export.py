@@ -2,12 +2,14 @@
 
 On disk the dimensions are ``(axis, tau, time)``, every time is an exact integer, every unit string is one that UDUNITS reads
 rightly, only data carries a fill value, and lists stand in the attributes as JSON. `open_dataset` turns all of that back
-(`gyrostab.cf` holds the rules). A file takes its final name only once it is complete.
+(`gyrostab.cf` holds the rules; `gyrostab.store` the chunks of a log). A file takes its final name only once it is complete.
 """
 
 from __future__ import annotations
 
 import os
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +17,22 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.cf import from_disk, to_disk
-from gyrostab.errors import FormatError, SchemaError
+from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.output import new_output
 from gyrostab.schema import check_log, check_product, check_surface
+from gyrostab.store import Misfit, append_netcdf, append_zarr, as_counts, chunk_samples, long_variables, open_stored
 
 __all__ = ["open_dataset", "open_log", "open_product", "open_surface", "to_netcdf", "to_zarr"]
 
 _CHUNK = 2**17  # values in one compressed chunk: 1 MiB of float64
 
 
-def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False, compression: str | None = None) -> Path:
     """Write a product, a DAVAR surface or a log as one flat CF NetCDF file.
 
     Lazy (dask) variables are computed together and chunk by chunk; none is held in memory as a whole.
-    A variable whose encoding declares an integer dtype and a ``scale_factor`` (counts of the source) is stored as integers.
+    A variable whose encoding declares an integer dtype and a ``scale_factor`` (counts of the source) is stored as integers
+    if that gives back the same numbers, bit for bit.
 
     Parameters
     ----------
@@ -38,6 +42,8 @@ def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
         The file to make. It takes this name only once it is complete.
     overwrite : bool
         Replace an existing file.
+    compression : {"zstd", "zlib"}, optional
+        zstd is four times as fast, zlib is read by every NetCDF program. By default zstd for a log, zlib for everything else.
 
     Returns
     -------
@@ -46,6 +52,8 @@ def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
 
     Raises
     ------
+    OptionError
+        When there is no such compression.
     OutputError
         When the file exists, or cannot be written; nothing half-written is left behind.
 
@@ -62,21 +70,48 @@ def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
     ...     open_log(to_netcdf(log, folder + "/log.nc")).time.values[1]
     np.datetime64('1970-01-01T00:00:00.003333333')
     """
+    stored = to_disk(dataset, "to_netcdf")
+    filters = _filters(compression, log=_rate(stored) is not None)
+
+    def write(packed: xr.Dataset) -> None:
+        long = long_variables(packed) if _rate(packed) is not None else {}
+        encoding = _netcdf_encoding(packed, filters)
+        rest = {name: options for name, options in encoding.items() if name not in long}
+        with new_output(path, overwrite=overwrite) as temporary:
+            packed.drop_vars(long).to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=rest)
+            append_netcdf(temporary, long, encoding)
+
+    _write_counts(stored, write)
+    return Path(path)
+
+
+def _netcdf_encoding(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, dict[str, Any]]:
     import netCDF4
 
-    stored = to_disk(dataset, "to_netcdf")
     encoding: dict[Any, dict[str, Any]] = {}
     for name, variable in stored.variables.items():
         text = variable.dtype.kind in "OUST"
-        encoding[name] = {"_FillValue": None, **({"dtype": "S1"} if text else {})}
+        encoding[name] = {} if "_FillValue" in variable.attrs else {"_FillValue": None, **({"dtype": "S1"} if text else {})}
         if _is_data(stored, name) and variable.dtype.kind == "f":
-            kept = np.dtype(variable.encoding.get("dtype", variable.dtype))
-            encoding[name] |= {**variable.encoding, "_FillValue": kept.type(netCDF4.default_fillvals[kept.str[1:]])}
+            encoding[name]["_FillValue"] = variable.dtype.type(netCDF4.default_fillvals[variable.dtype.str[1:]])
         if variable.ndim and variable.size and not text:
-            encoding[name] |= {"zlib": True, "complevel": 4, "shuffle": True, "chunksizes": _chunks(variable)}
-    with new_output(path, overwrite=overwrite) as temporary:
-        stored.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
-    return Path(path)
+            encoding[name] |= {**filters, "chunksizes": _chunks(variable, _rate(stored))}
+    return encoding
+
+
+def _filters(compression: str | None, *, log: bool) -> dict[str, Any]:
+    """Compression of a NetCDF file, with checksums where the compression has none of its own."""
+    import netCDF4
+
+    if compression not in (None, "zstd", "zlib"):
+        raise OptionError(f"compression={compression!r}: give 'zstd' or 'zlib'")
+    chosen = compression or ("zstd" if log else "zlib")
+    if chosen == "zstd":
+        with netCDF4.Dataset("probe", "w", diskless=True, persist=False) as probe:
+            if probe.has_zstd_filter():
+                return {"compression": "zstd", "complevel": 3, "shuffle": True, "fletcher32": True}
+        warnings.warn(f"netCDF library {netCDF4.__netcdf4libversion__} has no zstd here: the log is compressed with zlib", stacklevel=3)
+    return {"zlib": True, "complevel": 4, "shuffle": True}
 
 
 def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
@@ -110,19 +145,56 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
     ('axis', 'tau', 'time')
     """
     stored = to_disk(dataset, "to_zarr")
+
+    def write(packed: xr.Dataset) -> None:
+        long = long_variables(packed) if _rate(packed) is not None else {}
+        encoding = _zarr_encoding(packed)
+        rest = {name: options for name, options in encoding.items() if name not in long}
+        lazy = {name: packed[name].variable for name in rest if packed[name].chunks is not None}
+        aligned = {name: v.chunk(dict(zip(v.dims, encoding[name]["chunks"], strict=True))) for name, v in lazy.items()}
+        with new_output(path, overwrite=overwrite, directory=True) as temporary:
+            whole = packed.drop_vars(long).assign(aligned)
+            whole.to_zarr(temporary, mode="w", zarr_format=2, consolidated=not long, encoding=rest, write_empty_chunks=True)
+            append_zarr(temporary, long, encoding)
+
+    _write_counts(stored, write)
+    return Path(path)
+
+
+def _zarr_encoding(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
+    """Chunks and compression; every chunk of a log carries a checksum, as blosc has none."""
+    from numcodecs import Blosc, Fletcher32
+
     encoding: dict[Any, dict[str, Any]] = {}
     for name, variable in stored.variables.items():
-        encoding[name] = {"_FillValue": None}
+        encoding[name] = {} if "_FillValue" in variable.attrs else {"_FillValue": None}
         if _is_data(stored, name) and variable.dtype.kind == "f":
             encoding[name]["_FillValue"] = variable.dtype.type(np.nan)
         if variable.ndim and variable.size:
-            chunks = _chunks(variable)
-            encoding[name]["chunks"] = chunks
-            if variable.chunks is not None:
-                stored[name] = variable.chunk(dict(zip(variable.dims, chunks, strict=True)))
-    with new_output(path, overwrite=overwrite, directory=True) as temporary:
-        stored.to_zarr(temporary, mode="w", zarr_format=2, consolidated=True, encoding=encoding)
-    return Path(path)
+            encoding[name]["chunks"] = _chunks(variable, _rate(stored))
+            if _rate(stored) is not None and variable.dtype.kind in "if":
+                encoding[name] |= {"compressors": Blosc("lz4", clevel=5, shuffle=Blosc.SHUFFLE), "filters": [Fletcher32()]}
+    return encoding
+
+
+def _write_counts(stored: xr.Dataset, write: Callable[[xr.Dataset], None]) -> None:
+    """Write with integer counts where they are declared, in a wider type or as doubles where they turn out not to fit."""
+    while True:
+        try:
+            return write(stored.assign({name: as_counts(str(name), v.variable) for name, v in stored.data_vars.items()}))
+        except Misfit as misfit:
+            (name,) = misfit.args
+            declared = stored[name].encoding
+            if np.dtype(declared["dtype"]) != np.dtype("i4"):
+                stored[name].encoding = {**declared, "dtype": np.dtype("i4")}
+                continue
+            warnings.warn(f"{name}: not every value is a whole multiple of {declared['scale_factor']:g}; stored as doubles", stacklevel=3)
+            stored[name].encoding = {}
+
+
+def _rate(stored: xr.Dataset) -> float | None:
+    """Sampling rate of a log [Hz]; None for anything else."""
+    return float(stored.attrs["sampling_rate_hz"]) if stored.attrs["gyrostab_content"] == "log" else None
 
 
 def _is_data(dataset: xr.Dataset, name: Any) -> bool:
@@ -131,25 +203,30 @@ def _is_data(dataset: xr.Dataset, name: Any) -> bool:
     return name not in dataset.coords and name not in bounds
 
 
-def _chunks(variable: xr.Variable) -> tuple[int, ...]:
-    """One axis (and one term) a chunk, every tau, and as much time as fits."""
+def _chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
+    """One axis (and one term) a chunk, every tau, and as much time as fits; of a log 20 minutes."""
     inner = int(np.prod([size for dim, size in variable.sizes.items() if dim not in ("axis", "term", variable.dims[-1])]))
-    last = max(1, min(variable.shape[-1], _CHUNK // max(1, inner)))
+    most = max(1, _CHUNK // max(1, inner)) if rate is None else chunk_samples(rate)
+    last = max(1, min(variable.shape[-1], most))
     return tuple(last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size for dim, size in variable.sizes.items())
 
 
-def open_dataset(path: str | os.PathLike[str]) -> xr.Dataset:
+def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
     """Open what `to_netcdf` or `to_zarr` wrote, as it was in memory; data stays on disk (dask) until it is used.
 
     Parameters
     ----------
     path : path-like
         A NetCDF file or a Zarr directory.
+    strict : bool
+        What a chunk of a log does that turns out to be damaged or missing: raise `FormatError` as it is read, or
+        become a gap, of which a warning tells the file, the axis and the times.
 
     Returns
     -------
     xarray.Dataset
-        Product, surface or log: ``(axis, time, tau)``, units of `gyrostab.units.INNER`, a computed time axis for a log.
+        Product, surface or log: ``(axis, time, tau)``, units of `gyrostab.units.INNER`, a computed time axis for a log,
+        whose chunks are those on disk.
 
     Raises
     ------
@@ -163,19 +240,7 @@ def open_dataset(path: str | os.PathLike[str]) -> xr.Dataset:
     ...
     gyrostab.errors.FormatError: nothing.nc: there is no such file
     """
-    path = Path(path)
-    if not path.exists():
-        raise FormatError(f"{path}: there is no such file")
-    engine: Any = "zarr" if path.is_dir() else "netcdf4"
-    name = "Zarr" if path.is_dir() else "NetCDF"
-    try:
-        stored = xr.open_dataset(path, engine=engine, chunks={}, decode_times=False, create_default_indexes=False)
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise FormatError(f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again") from error
-    if "gyrostab_version" not in stored.attrs:
-        stored.close()
-        raise FormatError(f"{path}: is {name}, but not one that gyrostab wrote; read it with gyrostab.read_log (gyrostab ingest)")
-    return from_disk(stored)
+    return from_disk(open_stored(Path(path), strict=strict), str(path))
 
 
 def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -188,13 +253,13 @@ def open_surface(path: str | os.PathLike[str]) -> xr.Dataset:
     return _open(path, "a DAVAR surface", check_surface, "make one with 'gyrostab davar'")
 
 
-def open_log(path: str | os.PathLike[str]) -> xr.Dataset:
+def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
     """Open a regular log; as `open_dataset`, and `FormatError` when the file holds something else."""
-    return _open(path, "a regular log", check_log, "make one with 'gyrostab ingest'")
+    return _open(path, "a regular log", check_log, "make one with 'gyrostab ingest'", strict=strict)
 
 
-def _open(path: str | os.PathLike[str], what: str, check: Any, advice: str) -> xr.Dataset:
-    dataset = open_dataset(path)
+def _open(path: str | os.PathLike[str], what: str, check: Any, advice: str, *, strict: bool = False) -> xr.Dataset:
+    dataset = open_dataset(path, strict=strict)
     try:
         check(dataset)
     except SchemaError as error:

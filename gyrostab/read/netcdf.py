@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.cf import from_disk
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.read.arrays import float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
+from gyrostab.store import open_stored
 from gyrostab.timegrid import grid_times, time_coordinate
 from gyrostab.units import ON_DISK
 
@@ -53,7 +55,7 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Variables and sizes, the stamps of the two ends."""
-    log = _open_log(path)
+    log = _open_log(path, options)
     if log is not None:
         with log:
             return _summarise_log(path, log)
@@ -66,7 +68,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The regular log, lazily, or the raw log of a foreign file; see `gyrostab.read.read_log`."""
-    log = _open_log(path)
+    log = _open_log(path, options)
     if log is not None:
         return log
     import netCDF4
@@ -77,7 +79,7 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
         return read_columns(plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes=notes, limit=limit)
 
 
-def _open_log(path: Path) -> xr.Dataset | None:
+def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     """The file as a regular log of gyrostab, or None when it is something else."""
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     extra: Any = {"consolidated": False} if path.is_dir() else {}
@@ -85,6 +87,9 @@ def _open_log(path: Path) -> xr.Dataset | None:
         stored = xr.open_dataset(path, engine=engine, chunks={}, decode_times=False, **extra)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
+    if stored.attrs.get("gyrostab_content") == "log":
+        stored.close()
+        return _open_own(path, options)
     has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
     if not (has_signal and "sampling_rate_hz" in stored.attrs and {"axis", "time"} <= set(stored.variables)):
         stored.close()
@@ -107,6 +112,18 @@ def _open_log(path: Path) -> xr.Dataset | None:
     log.attrs = {name: value.item() if isinstance(value, np.generic) else value for name, value in log.attrs.items()}
     log.attrs.setdefault("source_files", [path.name])
     return _rebuild_time(path, log)
+
+
+def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
+    """A log that gyrostab wrote."""
+    log = from_disk(open_stored(path, strict=options.strict), path.name)
+    try:
+        check_log(log)
+    except SchemaError as error:
+        log.close()
+        raise SchemaError(f"{path.name}: {error}") from error
+    log.attrs.setdefault("source_files", [path.name])
+    return log
 
 
 def _rebuild_time(path: Path, log: xr.Dataset) -> xr.Dataset:

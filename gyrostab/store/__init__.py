@@ -1,0 +1,10 @@
+"""The working store: how the long variables of a log lie on disk in chunks, and how they are read back lazily.
+
+One chunk holds about 20 minutes of one axis. What a source delivered as integers is kept as integers with their factor, if that
+gives back the same doubles. A chunk that is missing or damaged becomes a gap, and a warning says where; never does it in silence.
+"""
+
+from gyrostab.store.read import open_stored
+from gyrostab.store.write import Misfit, append_netcdf, append_zarr, as_counts, chunk_samples, long_variables
+
+__all__ = ["Misfit", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "long_variables", "open_stored"]

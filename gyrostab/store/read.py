@@ -1,0 +1,260 @@
+"""Reading the long variables of a log lazily, chunk by chunk; a chunk that is damaged becomes a gap, and a warning says where."""
+
+from __future__ import annotations
+
+import errno
+import json
+import sys
+import threading
+import uuid
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.cf import declared_grids, decode_stamps, index_dim
+from gyrostab.errors import FormatError
+from gyrostab.kernels.counts import from_counts
+from gyrostab.store.lock import library_lock
+from gyrostab.timegrid import grid_times
+
+__all__ = ["open_stored"]
+
+
+def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
+    """Open what gyrostab wrote, as it lies on disk: times not decoded, data lazy, chunks of a log checked as they are read.
+
+    Parameters
+    ----------
+    path : Path
+        A NetCDF file or a Zarr directory.
+    strict : bool
+        A damaged chunk of a log is a `FormatError`, not a gap.
+
+    Raises
+    ------
+    FormatError
+        When there is no such file, when it is damaged as a whole, or when gyrostab did not write it.
+    """
+    if not path.exists():
+        raise FormatError(f"{path}: there is no such file")
+    engine: Any = "zarr" if path.is_dir() else "netcdf4"
+    name = "Zarr" if path.is_dir() else "NetCDF"
+    try:
+        stored = xr.open_dataset(path, engine=engine, chunks={}, decode_times=False, create_default_indexes=False)
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise FormatError(f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again") from error
+    if "gyrostab_version" not in stored.attrs:
+        stored.close()
+        raise FormatError(f"{path}: is {name}, but not one that gyrostab wrote; read it with gyrostab.read_log (gyrostab ingest)")
+    return _lazy_log(stored, path, strict=strict) if stored.attrs.get("gyrostab_content") == "log" else stored
+
+
+def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
+    """Put arrays that know about damage in place of the long variables of a log."""
+    import dask.array as da
+
+    file = None if path.is_dir() else _shared_file(path)
+    labels = [str(label) for label in stored["axis"].values]
+    opened = uuid.uuid4().hex
+    long: dict[Any, xr.Variable] = {}
+    for name, variable in stored.data_vars.items():
+        dim = str(variable.dims[-1]) if variable.dims else ""
+        disk = variable.encoding
+        chunks = disk.get("chunks" if path.is_dir() else "chunksizes")
+        if not dim.startswith("time") or variable.dtype.kind != "f" or not variable.size or chunks is None:
+            continue
+        own = all(size == 1 for size in chunks[:-1]) and (file is not None or _is_plain(path / str(name)))
+        if not own or ("scale_factor" in disk and "_FillValue" not in disk):
+            continue  # some other program has laid it out anew
+        array = _Chunks(
+            path=path,
+            name=str(name),
+            rows=tuple(f"axis {label}" for label in labels) if variable.ndim == 2 else (f"channel {name}",),
+            shape=variable.shape,
+            dtype=variable.dtype,
+            length=int(chunks[-1]),
+            scale=disk.get("scale_factor"),
+            fill=disk.get("_FillValue"),
+            spans=_spans(stored, dim, int(chunks[-1])),
+            strict=strict,
+            opened=opened,
+            file=file,
+        )
+        meta = np.empty((0,) * variable.ndim, variable.dtype)
+        lazy = da.from_array(
+            array, chunks=tuple(chunks), name=f"gyrostab-{name}-{opened}", asarray=False, fancy=False, inline_array=True, meta=meta
+        )
+        packing = {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)} if array.scale is not None else {}
+        long[name] = xr.Variable(variable.dims, lazy, variable.attrs, packing)
+    close = stored._close
+    log = stored.assign(long)
+
+    def close_all() -> None:
+        if close is not None:
+            close()
+        if file is not None:
+            file.close()
+
+    log.set_close(close_all)
+    return log
+
+
+def _shared_file(path: Path) -> Any:
+    """A NetCDF file that is opened when it is needed, once in each process, and travels between processes as its name."""
+    import netCDF4
+    from xarray.backends import CachingFileManager
+
+    return CachingFileManager(netCDF4.Dataset, str(path.absolute()), mode="r", lock=library_lock())
+
+
+def _is_plain(folder: Path) -> bool:
+    """Whether a Zarr array is of format 2 in rows, which `_Chunks` reads by itself."""
+    try:
+        return bool(json.loads((folder / ".zarray").read_text())["order"] == "C")
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _spans(stored: xr.Dataset, dim: str, length: int) -> dict[str, Any] | tuple[tuple[int, int], ...]:
+    """The rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
+    rules = {index_dim(rule["dim"]): rule for rule in declared_grids(stored).values()}
+    if dim in rules:
+        return rules[dim]
+    if dim not in stored.variables:
+        return ()
+    stamps = decode_stamps(stored.variables[dim]).values.view(np.int64)
+    return tuple((int(stamps[at]), int(stamps[min(at + length, stamps.size) - 1])) for at in range(0, stamps.size, length))
+
+
+class _Damage(Exception):
+    """A chunk that cannot be read; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Chunks:
+    """One variable on disk, by rows and stretches of `length` samples, behind the few attributes that dask asks for."""
+
+    path: Path
+    name: str
+    rows: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    length: int
+    scale: float | None
+    fill: Any
+    spans: dict[str, Any] | tuple[tuple[int, int], ...]
+    strict: bool
+    opened: str
+    file: Any
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    def __getitem__(self, part: Any) -> NDArray[np.floating[Any]]:
+        last = range(*part[-1].indices(self.shape[-1]))
+        if self.ndim == 1:
+            return self._row(None, last)
+        return np.stack([self._row(row, last) for row in range(*part[0].indices(self.shape[0]))])
+
+    def _row(self, row: int | None, wanted: range) -> NDArray[np.floating[Any]]:
+        """Samples of one row; a damaged chunk of it is NaN."""
+        begin, end = wanted.start, wanted.stop
+        pieces = []
+        while begin < end:
+            number = begin // self.length
+            stop = min(end, (number + 1) * self.length)
+            try:
+                pieces.append(self._decoded(self._zarr(row, number, begin, stop) if self.file is None else self._netcdf(row, begin, stop)))
+            except _Damage as damage:
+                self._tell(row or 0, number, str(damage))
+                pieces.append(np.full(stop - begin, np.nan, self.dtype))
+            begin = stop
+        whole = pieces[0] if len(pieces) == 1 else np.concatenate([*pieces, np.empty(0, self.dtype)])
+        return whole[:: wanted.step]
+
+    def _decoded(self, raw: NDArray[Any]) -> NDArray[np.floating[Any]]:
+        if self.scale is not None:
+            return from_counts(raw, float(self.scale), int(self.fill))
+        values = raw.astype(self.dtype)
+        if self.fill is not None and self.fill == self.fill:
+            values[raw == self.fill] = np.nan
+        return values
+
+    def _netcdf(self, row: int | None, begin: int, stop: int) -> NDArray[Any]:
+        with library_lock():
+            try:
+                variable = self.file.acquire(needs_lock=False).variables[self.name]
+            except (OSError, KeyError) as error:
+                raise FormatError(f"{self.path}: cannot be opened again ({error}); has it been moved or changed?") from error
+            variable.set_auto_maskandscale(False)
+            try:
+                return np.asarray(variable[begin:stop] if row is None else variable[row, begin:stop])
+            except (OSError, RuntimeError) as error:
+                raise _Damage(f"is damaged: {error}") from error
+
+    def _zarr(self, row: int | None, number: int, begin: int, stop: int) -> NDArray[Any]:
+        folder = self.path / self.name
+        codecs, dtype, separator = _zarr_layout(folder, self.opened)
+        name = str(number) if row is None else f"{row}{separator}{number}"
+        try:
+            data = (folder / name).read_bytes()
+            for codec in codecs:
+                data = codec.decode(data)
+            whole = np.frombuffer(data, dtype)
+        except FileNotFoundError as error:
+            if not folder.is_dir():
+                raise FormatError(f"{folder}: is not there any more; has it been moved or removed?") from error
+            raise _Damage(f"is missing: no file {self.name}/{name}") from error
+        except (OSError, RuntimeError, ValueError) as error:
+            if isinstance(error, OSError) and error.errno not in (None, errno.EIO):
+                raise FormatError(f"{folder / name}: cannot be read ({error.strerror})") from error
+            raise _Damage(f"is damaged: {self.name}/{name}: {error}") from error
+        if whole.size != self.length:
+            raise _Damage(f"is damaged: {self.name}/{name} holds {whole.size} values in place of {self.length}")
+        return whole[begin - number * self.length : stop - number * self.length]
+
+    def _tell(self, row: int, number: int, damage: str) -> None:
+        """Warn of a damaged chunk, once; or stop at it."""
+        if isinstance(self.spans, dict):
+            grid, end = self.spans, min((number + 1) * self.length, self.shape[-1])
+            ends = grid["first"] + grid["stride"] * np.array([number * self.length, end - 1])
+            span = grid_times(grid["start_ns"], grid["rate_hz"], ends)
+        else:
+            span = np.array(self.spans[number] if self.spans else (), dtype=np.int64)
+        when = " to ".join(str(stamp).rstrip("0").rstrip(".") for stamp in span.view("datetime64[ns]"))
+        what = f"{self.path}: {self.rows[row]}: the chunk from {when} {damage}"
+        if self.strict:
+            raise FormatError(f"{what}; copy it again, or leave out --strict to take these samples as missing")
+        with _TELLING:
+            _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
+
+
+@lru_cache(maxsize=256)
+def _zarr_layout(folder: Path, opened: str) -> tuple[list[Any], np.dtype[Any], str]:
+    """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk; looked up once an opening."""
+    import numcodecs
+
+    try:
+        layout = json.loads((folder / ".zarray").read_text())
+    except OSError as error:
+        raise FormatError(f"{folder}: cannot be read any more ({error.strerror}); has it been moved or removed?") from error
+    codecs = [numcodecs.get_codec(item) for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item]
+    return codecs, np.dtype(layout["dtype"]), layout.get("dimension_separator", ".")
+
+
+_TELLING = threading.Lock()
+
+
+@lru_cache(maxsize=2**16)
+def _warn_once(opened: str, message: str) -> None:
+    """Warn; the cache makes it once for each opening of a file. In a worker of dask.distributed the warning goes to the client."""
+    distributed = sys.modules.get("distributed")
+    warn = getattr(distributed, "warn", warnings.warn)
+    warn(message, UserWarning)

@@ -1,0 +1,172 @@
+"""Writing the long variables of a log: counts where the source had them, in chunks of one axis and about 20 minutes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.kernels.counts import to_counts
+from gyrostab.store.lock import library_lock
+
+__all__ = ["Misfit", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "long_variables"]
+
+CHUNK_SECONDS = 1200.0
+#: Bounds of the samples in one chunk, for very slow and very fast logs.
+CHUNK_LIMITS = (2**16, 2**22)
+#: Size [bytes] of the doubles that are computed at one time while a lazy log is written.
+STRETCH_BYTES = 2**26
+FILLS = {"int16": -32767, "int32": -2147483647}  # the defaults of NetCDF
+
+
+class Misfit(ValueError):
+    """A variable does not consist of counts after all; `args` is its name."""
+
+
+def chunk_samples(rate: float) -> int:
+    """Samples in one chunk of a log of `rate` [Hz]: 20 minutes, but neither very few nor very many.
+
+    Examples
+    --------
+    >>> chunk_samples(400.0), chunk_samples(1.0)
+    (480000, 65536)
+    """
+    return int(np.clip(round(CHUNK_SECONDS * rate), *CHUNK_LIMITS))
+
+
+def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
+    """Turn a variable whose encoding declares an integer dtype and a factor into counts of 16 or 32 bits; any other stays as it is.
+
+    Raises
+    ------
+    Misfit
+        When counts do not give the same doubles; for a lazy variable, only as it is computed.
+    """
+    scale, declared = variable.encoding.get("scale_factor"), np.dtype(variable.encoding.get("dtype", "f8"))
+    if not scale or declared.kind not in "iu" or variable.dtype != np.float64 or variable.encoding.get("add_offset"):
+        return xr.Variable(variable.dims, variable.data, variable.attrs)
+    dtype = "int16" if declared.itemsize == 1 or declared == np.int16 else "int32"
+    pack = partial(_counts, name=name, scale=float(scale), dtype=dtype)
+    data = variable.data
+    lazy = variable.chunks is not None
+    packed = data.map_blocks(pack, dtype=dtype, meta=np.empty((0,) * variable.ndim, dtype)) if lazy else pack(data)
+    return xr.Variable(
+        variable.dims, packed, {**variable.attrs, "scale_factor": float(scale), "_FillValue": np.dtype(dtype).type(FILLS[dtype])}
+    )
+
+
+def _counts(values: NDArray[np.float64], *, name: str, scale: float, dtype: str) -> NDArray[np.integer[Any]]:
+    counts = to_counts(values, scale, dtype, FILLS[dtype])
+    if counts is None:
+        raise Misfit(name)
+    return counts
+
+
+def long_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
+    """Lazy variables along time, which are written stretch by stretch."""
+    lazy = {str(name): array.variable for name, array in stored.data_vars.items() if array.chunks is not None and array.size}
+    return {name: variable for name, variable in lazy.items() if str(variable.dims[-1]).startswith("time")}
+
+
+def _names(variable: xr.Variable) -> list[str]:
+    return [str(dim) for dim in variable.dims]
+
+
+def append_netcdf(path: Path, long: dict[str, xr.Variable], encoding: dict[Any, dict[str, Any]]) -> None:
+    """Add lazy variables to a NetCDF file that holds the others already; `encoding` as for xarray."""
+    import netCDF4
+
+    lock = library_lock()
+    with lock:
+        file = netCDF4.Dataset(path, "a")
+    try:
+        targets = {}
+        with lock:
+            for name, variable in long.items():
+                for dim, size in variable.sizes.items():
+                    if dim not in file.dimensions:
+                        file.createDimension(str(dim), size)
+                options = dict(encoding[name])
+                fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
+                targets[name] = file.createVariable(name, variable.dtype, _names(variable), fill_value=fill, **options)
+                targets[name].setncatts({key: value for key, value in variable.attrs.items() if key != "_FillValue"})
+                targets[name].set_auto_maskandscale(False)
+
+        def put(name: str, row: tuple[int, ...], part: slice, values: NDArray[Any]) -> None:
+            with lock:
+                targets[name][(*row, part)] = values
+
+        _copy(long, {name: encoding[name]["chunksizes"][-1] for name in long}, put)
+    finally:
+        with lock:
+            file.close()
+
+
+def append_zarr(path: Path, long: dict[str, xr.Variable], encoding: dict[Any, dict[str, Any]]) -> None:
+    """Add lazy variables to a Zarr store that holds the others already, every chunk of them, and gather the metadata."""
+    import zarr
+
+    group = zarr.open_group(path, mode="r+", zarr_format=2)
+    targets: dict[str, Any] = {}
+    for name, variable in long.items():
+        options = dict(encoding[name])
+        fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
+        attrs = {key: value for key, value in variable.attrs.items() if key != "_FillValue"}
+        targets[name] = group.create_array(
+            name,
+            shape=variable.shape,
+            dtype=variable.dtype,
+            fill_value=fill,
+            attributes={"_ARRAY_DIMENSIONS": _names(variable), **attrs},
+            config={"write_empty_chunks": True},
+            **options,
+        )
+
+    def put(name: str, row: tuple[int, ...], part: slice, values: NDArray[Any]) -> None:
+        targets[name][(*row, part)] = values
+
+    _copy(long, {name: encoding[name]["chunks"][-1] for name in long}, put)
+    zarr.consolidate_metadata(path, zarr_format=2)
+
+
+def _copy(long: dict[str, xr.Variable], lengths: dict[str, int], put: Callable[[str, tuple[int, ...], slice, NDArray[Any]], None]) -> None:
+    """Compute lazy variables a few chunks at a time, for all of them at once, and write each chunk while the next ones are computed."""
+    import dask
+
+    def write(parts: list[tuple[str, tuple[int, ...], int]], blocks: Sequence[NDArray[Any]]) -> None:
+        for (name, row, begin), block in zip(parts, blocks, strict=True):
+            for at in range(0, block.shape[-1], lengths[name]):
+                piece = block[..., at : at + lengths[name]]
+                put(name, row, slice(begin + at, begin + at + piece.shape[-1]), piece)
+
+    with ThreadPoolExecutor(1, thread_name_prefix="gyrostab-write") as pool:
+        writing: Future[None] | None = None
+        for parts in _stretches(long, lengths):
+            arrays = [_part(long[name], row, begin, span) for name, row, begin, span in parts]
+            blocks = dask.compute(*arrays)
+            if writing is not None:
+                writing.result()
+            writing = pool.submit(write, [part[:3] for part in parts], blocks)
+        if writing is not None:
+            writing.result()
+
+
+def _part(variable: xr.Variable, row: tuple[int, ...], begin: int, span: int) -> Any:
+    return variable.data[(*row, slice(begin, begin + span))]
+
+
+def _stretches(long: dict[str, xr.Variable], lengths: dict[str, int]) -> Iterator[list[tuple[str, tuple[int, ...], int, int]]]:
+    """Stretches of whole chunks, of all variables on one time: name, row, first sample, number of samples of each part."""
+    for dim in dict.fromkeys(variable.dims[-1] for variable in long.values()):
+        rows = [(name, row) for name, variable in long.items() if variable.dims[-1] == dim for row in np.ndindex(*variable.shape[:-1])]
+        name = rows[0][0]
+        span = lengths[name] * max(1, STRETCH_BYTES // (8 * len(rows) * lengths[name]))
+        size = long[name].shape[-1]
+        for begin in range(0, size, span):
+            yield [(name, row, begin, min(span, size - begin)) for name, row in rows]
