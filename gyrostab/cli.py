@@ -5,20 +5,17 @@ Exit codes: 0 done; 2 bad input or usage, with one message on stderr; 3 interrup
 
 from __future__ import annotations
 
-import errno
-import signal
 import sys
-import threading
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, TextIO
+from typing import Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, Parameter
 
-from gyrostab.errors import FormatError, GyrostabError, OptionError
-from gyrostab.options import Common, Fitting, Reading, Windows, read_toml
+from gyrostab.console import complain, explain, plain_notes, read_config, stoppable
+from gyrostab.errors import FormatError, OptionError
+from gyrostab.options import Common, Fitting, Reading, Running, Windows
 
 __all__ = ["app", "main"]
 
@@ -125,11 +122,12 @@ def run(
     windows: Windows = Windows(),
     fitting: Fitting = Fitting(),
     reading: Reading = Reading(),
+    running: Running = Running(),
     common: Common = Common(),
 ) -> None:
     """Go the whole way from logs to the product: uniform time, dynamic Allan variance, noise coefficients, NetCDF.
 
-    The log may be larger than the memory.
+    The log may be larger than the memory. A run that was stopped goes on with --resume.
 
     Example: gyrostab run run7/*.csv -o product.nc --window 10min --step 1min
 
@@ -150,13 +148,25 @@ def run(
             windows=windows.options(),
             fitting=fitting.options(),
             overwrite=common.overwrite,
+            resume=running.resume,
+            scheduler=running.scheduler,
+            workers=common.workers,
             stage=stage,
         )
     print(target)
 
 
 @app.command(sort_key=4, help_epilogue="")
-def davar(logs: Logs, /, *, output: Output, windows: Windows = Windows(), reading: Reading = Reading(), common: Common = Common()) -> None:
+def davar(
+    logs: Logs,
+    /,
+    *,
+    output: Output,
+    windows: Windows = Windows(),
+    reading: Reading = Reading(),
+    running: Running = Running(),
+    common: Common = Common(),
+) -> None:
     """Compute the dynamic Allan variance of a log.
 
     Example: gyrostab davar run7.nc -o davar.nc --window 10min --step 1min
@@ -168,16 +178,21 @@ def davar(logs: Logs, /, *, output: Output, windows: Windows = Windows(), readin
     output
         NetCDF file to write.
     """
-    from gyrostab.davar import davar as compute
-    from gyrostab.export import to_netcdf
-    from gyrostab.run import check_output, load_log, samples_of
+    from gyrostab.run import run as run_job
 
-    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=logs)
     with _work(common) as stage:
-        stage("reading", 0)
-        dataset = load_log(logs, **reading.options())
-        stage("computing", samples_of(dataset))
-        to_netcdf(compute(dataset, **windows.options()), target, overwrite=common.overwrite)
+        target = run_job(
+            logs,
+            output,
+            reading=reading.options(),
+            windows=windows.options(),
+            surface_only=True,
+            overwrite=common.overwrite,
+            resume=running.resume,
+            scheduler=running.scheduler,
+            workers=common.workers,
+            stage=stage,
+        )
     print(target)
 
 
@@ -362,79 +377,6 @@ def export(
     print(target)
 
 
-def _config(tokens: Sequence[str]) -> Any:
-    """Reader of the option defaults in the file that ``--config`` names, for cyclopts; None without one."""
-    name = None
-    for place, token in enumerate(tokens):
-        if token == "--config" and place + 1 < len(tokens):
-            name = tokens[place + 1]
-        elif token.startswith("--config="):
-            name = token.removeprefix("--config=")
-    if name is None:
-        return None
-    table = read_toml(Path(name))
-    commands = [command for command in app if not command.startswith("-")]
-    strange = [key for key, value in table.items() if isinstance(value, dict) and key not in commands]
-    if strange:
-        raise OptionError(f"{name}: table [{strange[0]}] is not a command; the commands are {', '.join(commands)}")
-
-    def apply(current: Any, path: tuple[str, ...], arguments: Any) -> None:
-        from cyclopts.config import Dict
-
-        defaults = {key: value for key, value in table.items() if not isinstance(value, dict)}
-        defaults |= table.get(path[0], {}) if path else {}
-        for key, value in defaults.items():
-            if isinstance(value, dict):  # [run.map] wx = "gyro_x"
-                defaults[key] = [f"{left}={right}" for left, right in value.items()]
-        Dict(defaults, source=name, use_commands_as_keys=False)(current, path, arguments)
-
-    return apply
-
-
-@contextmanager
-def _notes() -> Iterator[None]:
-    """Show each warning of the package once, as one plain line."""
-    seen: set[str] = set()
-
-    def show(
-        message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None, line: str | None = None
-    ) -> None:
-        text = str(message)
-        if text not in seen:
-            seen.add(text)
-            print(f"note: {text}", file=sys.stderr)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("default", UserWarning)
-        warnings.showwarning = show
-        yield
-
-
-@contextmanager
-def _stoppable() -> Iterator[None]:
-    """Let a polite ``kill``, a time limit or a closed terminal end the work as Ctrl-C does, with nothing left behind."""
-
-    def stop(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = [number for number in signals if signal.getsignal(number) is signal.SIG_DFL]  # not under nohup
-    if threading.current_thread() is not threading.main_thread():
-        ours = []
-    for number in ours:
-        signal.signal(number, stop)
-    try:
-        yield
-    finally:
-        for number in ours:
-            signal.signal(number, signal.SIG_DFL)
-
-
-def _complain(text: str, code: int) -> int:
-    print(f"gyrostab: {text}", file=sys.stderr)
-    return code
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -456,32 +398,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
     try:
-        app.config = _config(tokens)
-        with _notes(), _stoppable():
+        app.config = read_config(tokens, [command for command in app if not command.startswith("-")])
+        with plain_notes(), stoppable():
             app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
-    except KeyboardInterrupt:
-        return _complain("interrupted; nothing was written under the name of the output. Start the same command again.", 3)
+    except KeyboardInterrupt as stop:
+        said = str(stop) or "interrupted; nothing was written under the name of the output. Start the same command again."
+        return complain(said, 3)
     except BrokenPipeError:  # the reader of our output, for instance `head`, has left
         sys.stderr.close()
         return 0
     except Exception as error:
         if debug:
             raise
-        return _explain(error)
+        return explain(error)
     return 0
-
-
-def _explain(error: Exception) -> int:
-    """One message for an error, and the exit code."""
-    if isinstance(error, CycloptsError):
-        return _complain(f"{error} See gyrostab --help, or the command's own --help.", 2)
-    if isinstance(error, GyrostabError):
-        return _complain(str(error), 2)
-    if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError) and error.filename:
-        return _complain(f"{error.filename}: {error.strerror}", 2)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        where = error.filename or "the standard output"
-        return _complain(f"{where}: cannot be written ({error.strerror}); make room, or write elsewhere", 2)
-    if isinstance(error, MemoryError):
-        return _complain(f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers", 1)
-    return _complain(f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.", 1)

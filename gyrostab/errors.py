@@ -12,9 +12,11 @@ __all__ = [
     "MissingUnitError",
     "OptionError",
     "OutputError",
+    "ResumeError",
     "SchemaError",
     "TimeError",
     "UnitError",
+    "WorkerError",
 ]
 
 
@@ -48,3 +50,11 @@ class SchemaError(GyrostabError, ValueError):
 
 class OutputError(GyrostabError, OSError):
     """A result cannot be written; nothing half-written is left behind."""
+
+
+class ResumeError(GyrostabError, ValueError):
+    """A run that was begun cannot be continued, or not by this process."""
+
+
+class WorkerError(GyrostabError, RuntimeError):
+    """The processes that were to do the work cannot be reached, cannot see the files, or have died."""

@@ -13,12 +13,13 @@ from cyclopts.validators import Number
 
 from gyrostab.errors import OptionError
 
-__all__ = ["Common", "Fitting", "Flag", "Reading", "Windows", "read_toml"]
+__all__ = ["Common", "Fitting", "Flag", "Reading", "Running", "Windows", "read_toml"]
 
 _READING = Group("Reading options", sort_key=1)
 _WINDOWS = Group("Analysis options", sort_key=2)
 _FITTING = Group("Fitting options", sort_key=3)
-_COMMON = Group("Common options", sort_key=4)
+_RUNNING = Group("Running options", sort_key=4)
+_COMMON = Group("Common options", sort_key=5)
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 
 
@@ -131,6 +132,23 @@ class Fitting:
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `gyrostab.fit.fit_noise`."""
         return {"terms": self.terms, "method": self.fit_method, "tau_min": self.fit_from, "tau_max": self.fit_to}
+
+
+@Parameter(name="*", group=_RUNNING)
+@dataclass(frozen=True)
+class Running:
+    """How long work is done, and done again.
+
+    Parameters
+    ----------
+    resume
+        Continue a run that was stopped or killed; begin one where there is none.
+    scheduler
+        Who does the work: threads, processes, or the workers of a dask scheduler at this address, tcp://cluster:8786.
+    """
+
+    resume: Flag = False
+    scheduler: Annotated[str, Parameter(metavar="ADDRESS")] = "threads"
 
 
 @Parameter(name="*", group=_COMMON)

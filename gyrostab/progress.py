@@ -4,17 +4,33 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 __all__ = ["Stage", "no_stage", "show_progress"]
 
-#: Called as ``stage("computing", samples)`` when a stage begins; `samples` (over all axes) gives the rate.
-Stage = Callable[[str, int], None]
+
+class Stage(Protocol):
+    """What a long function tells of its progress."""
+
+    def __call__(self, label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
+        """Begin a stage (another label than before), or say how much of it is done.
+
+        Parameters
+        ----------
+        label : str
+            Name of the stage.
+        total : int
+            What is to be done in it: samples over all axes, files ...; 0 when nobody knows.
+        done : int, optional
+            What is done of it. A stage that does not say so moves with the tasks that dask finishes.
+        unit : str
+            What is counted.
+        """
 
 
-def no_stage(label: str, samples: int = 0) -> None:
+def no_stage(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
     """Show nothing."""
 
 
@@ -35,7 +51,7 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
     Examples
     --------
     >>> with show_progress(quiet=True) as stage:
-    ...     stage("reading", 0)
+    ...     stage("reading", 12, 3, "files")
     """
     if quiet:
         yield no_stage
@@ -47,19 +63,27 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
             yield stage
 
 
+def _speed(amount: float, seconds: float, unit: str) -> str:
+    """Throughput of samples; other things are too few to have one."""
+    return f"{amount / seconds / 1e6:.2f} Msamples/s" if unit == "samples" and seconds > 0 else ""
+
+
 @contextmanager
 def _line() -> Iterator[Stage]:
     """One line when the work is done."""
     begun = since = time.perf_counter()
-    current, worked = ("", 0), ""
+    current, first, amount, worked = "", 0, 0, ""
 
-    def stage(label: str, samples: int = 0) -> None:
-        nonlocal since, current, worked
-        now, (before, count) = time.perf_counter(), current
-        if count:
-            seconds = max(now - since, 1e-9)
-            worked = f" ({before}: {count:,} samples in {seconds:.1f} s, {count / seconds / 1e6:.2f} Msamples/s)"
-        since, current = now, (label, samples)
+    def stage(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
+        nonlocal since, current, first, amount, worked
+        now = time.perf_counter()
+        if label != current:
+            if amount:
+                seconds = max(now - since, 1e-9)
+                worked = f" ({current}: {amount:,} samples in {seconds:.1f} s, {_speed(amount, seconds, 'samples')})"
+            since, current, first, amount = now, label, done or 0, 0
+        if unit == "samples":
+            amount = total - first  # what an earlier run has done counts for nothing here
 
     yield stage
     stage("", 0)
@@ -68,7 +92,7 @@ def _line() -> Iterator[Stage]:
 
 @contextmanager
 def _bar() -> Iterator[Stage]:
-    """One bar per stage, moved by the tasks that dask finishes."""
+    """One bar per stage, with throughput and the time left."""
     from dask.callbacks import Callback
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -81,28 +105,35 @@ def _bar() -> Iterator[Stage]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        now: dict[str, Any] = {"task": None, "samples": 0, "total": 0, "done": 0, "begun": 0.0}
+        now: dict[str, Any] = {"label": "", "task": None, "total": 0, "first": None, "begun": 0.0, "tasks": 0, "ended": 0}
 
         def finish() -> None:
             if now["task"] is not None:
                 progress.update(now["task"], total=1.0, completed=1.0)
 
-        def stage(label: str, samples: int = 0) -> None:
-            finish()
-            task = progress.add_task(f"{label:<10}", total=None, speed="")
-            now.update(task=task, samples=samples, total=0, done=0, begun=time.perf_counter())
+        def show(share: float, amount: float, unit: str) -> None:
+            said = _speed(amount, time.perf_counter() - now["begun"], unit)
+            progress.update(now["task"], total=1.0, completed=share, speed=said)
+
+        def stage(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
+            if label != now["label"]:
+                finish()
+                task = progress.add_task(f"{label:<10}", total=None, speed="") if label else None
+                now.update(label=label, task=task, total=total, first=done, begun=time.perf_counter(), tasks=0, ended=0)
+            if done is not None and total:
+                now["first"] = done if now["first"] is None else now["first"]
+                show(done / total, done - now["first"], unit)
+                if unit != "samples":
+                    progress.update(now["task"], speed=f"{unit[:-1]} {done} of {total}")
 
         def start(graph: Any, state: dict[str, Any]) -> None:
-            now["total"] += len(state["waiting"]) + len(state["ready"])
+            now["tasks"] += len(state["waiting"]) + len(state["ready"])
 
         def after(key: Any, result: Any, graph: Any, state: Any, worker: Any) -> None:
-            now["done"] += 1
-            if now["task"] is None or not now["total"]:
-                return
-            share = min(now["done"] / now["total"], 1.0)
-            seconds = time.perf_counter() - now["begun"]
-            speed = f"{share * now['samples'] / seconds / 1e6:.1f} Msamples/s" if now["samples"] and seconds > 0 else ""
-            progress.update(now["task"], total=1.0, completed=share, speed=speed)
+            now["ended"] += 1
+            if now["task"] is not None and now["tasks"] and now["first"] is None:
+                share = min(now["ended"] / now["tasks"], 1.0)
+                show(share, share * now["total"], "samples")
 
         with Callback(start_state=start, posttask=after):
             yield stage

@@ -2,70 +2,39 @@
 
 from __future__ import annotations
 
-import math
-import tempfile
+import json
+import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import xarray as xr
 
-from gyrostab.errors import OptionError, OutputError
+from gyrostab.checkpoint import find_blocks
+from gyrostab.checks import check_output, check_windows
+from gyrostab.engine import Blocks, compute_blocks, compute_part, share_constant, write_blocks
+from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
+from gyrostab.job import (
+    begin_job,
+    clear_job,
+    describe_inputs,
+    differences,
+    digest,
+    folder_of,
+    hold,
+    is_begun,
+    kept_parts,
+    make_fingerprint,
+    read_job,
+    remove_job,
+    remove_leftovers,
+)
 from gyrostab.progress import Stage, no_stage
+from gyrostab.schedule import Pool, check_scheduler, open_pool
 
 __all__ = ["check_output", "check_windows", "load_log", "run", "samples_of"]
-
-
-def check_output(path: str | Path, *, suffixes: Sequence[str] = (), overwrite: bool = False, inputs: Iterable[str | Path] = ()) -> Path:
-    """Make sure, before the long work starts, that a result can be written.
-
-    Parameters
-    ----------
-    path : str or Path
-        File (or Zarr folder) to be written.
-    suffixes : sequence of str
-        Endings that the stage can write, with the dot; empty for any.
-    overwrite : bool
-        Whether an existing output may be replaced.
-    inputs : iterable of path
-        Files that are read, which the output must not replace.
-
-    Returns
-    -------
-    Path
-        The path.
-
-    Raises
-    ------
-    OptionError
-        When the name has the wrong ending, or is an input.
-    OutputError
-        When the output exists and `overwrite` is not given, or its folder cannot be written to.
-
-    Examples
-    --------
-    >>> check_output("product.txt", suffixes=[".nc"])
-    Traceback (most recent call last):
-    gyrostab.errors.OptionError: output 'product.txt' must end in .nc; give another name with -o
-    """
-    path = Path(path)
-    if suffixes and path.suffix.lower() not in suffixes:
-        raise OptionError(f"output {str(path)!r} must end in {' or '.join(suffixes)}; give another name with -o")
-    if any(Path(item).resolve() == path.resolve() for item in inputs):
-        raise OptionError(f"output {str(path)!r} is also an input and would be destroyed; give another name with -o")
-    if path.is_dir() and path.suffix.lower() != ".zarr":
-        raise OutputError(f"output {str(path)!r} is a directory; give another name with -o")
-    if path.is_file() and path.suffix.lower() == ".zarr":
-        raise OutputError(f"output {str(path)!r} is a file, and Zarr needs a directory; give another name with -o")
-    if path.exists() and not overwrite:
-        raise OutputError(f"output {str(path)!r} exists already; give --overwrite to replace it, or another name with -o")
-    try:
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise OutputError(f"output {str(path)!r}: nothing can be written in {str(path.parent)!r} ({error.strerror})") from error
-    return path
 
 
 def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: Any) -> xr.Dataset:
@@ -110,45 +79,6 @@ def _said(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau_max: str | None = None, **other: Any) -> None:
-    """Make sure, before the long work starts, that the lengths of time can be read at all.
-
-    Parameters
-    ----------
-    window, step, taus, tau_max : str
-        Options of `gyrostab.davar.davar`, as text; others are passed over.
-
-    Raises
-    ------
-    OptionError
-        When one of them is no length of time, or the step or an averaging time is too long for the window.
-
-    Examples
-    --------
-    >>> check_windows(window="10", step="1min")
-    Traceback (most recent call last):
-    gyrostab.errors.OptionError: window '10' has no unit; write for instance 10s, 10min or 10samples
-    """
-    from gyrostab.windows import averaging_factors, duration_seconds, samples
-
-    fine = 1e6  # Hz; the true rate is not known yet
-    length, hop = samples(window, fine, "window"), samples(step, fine, "step") if step else 1
-    if step and ("sample" in window) == ("sample" in step) and hop > length:
-        raise OptionError(f"the step of {step} is longer than the window of {window}, so samples would be left out; give a shorter --step")
-    half = None if "sample" in window else length / fine / 2  # how long a number of samples is depends on the rate
-    given = [tau_max] if tau_max else []
-    if taus.strip().isdigit():
-        averaging_factors(taus, rate=fine, window=2)
-    elif taus.strip() not in ("octave", "all"):
-        given += taus.split(",")
-    for tau in given:
-        if duration_seconds(tau, "tau") > (half or math.inf):
-            raise OptionError(
-                f"tau {tau.strip()} is longer than half of the window of {window}, so no second difference fits; "
-                "give a longer --window or a shorter tau"
-            )
-
-
 def samples_of(log: xr.Dataset) -> int:
     """Count the samples of a log over all its axes."""
     return int(log.sizes["axis"] * log.sizes["time"])
@@ -161,10 +91,17 @@ def run(
     reading: Mapping[str, Any] | None = None,
     windows: Mapping[str, Any] | None = None,
     fitting: Mapping[str, Any] | None = None,
+    surface_only: bool = False,
     overwrite: bool = False,
+    resume: bool = False,
+    scheduler: str = "threads",
+    workers: int | None = None,
     stage: Stage = no_stage,
 ) -> Path:
-    """Make the product of some logs and write it as NetCDF, without holding the log in memory.
+    """Make the product of some logs and write it as NetCDF, without holding the log in memory, and so that it can be continued.
+
+    The work is done in parts, and each finished part is kept in the folder ``.PRODUCT.nc.job`` beside the output until
+    the product is complete. A run that was stopped, or killed, is continued with `resume`; its product is the same, bit for bit.
 
     Parameters
     ----------
@@ -174,40 +111,220 @@ def run(
         NetCDF file to be written.
     reading, windows, fitting : mapping
         Options of `gyrostab.read.read_log`, `gyrostab.davar.davar` and `gyrostab.fit.fit_noise`.
+    surface_only : bool
+        Write the dynamic Allan variance without fitting it.
     overwrite : bool
-        Whether an existing output may be replaced.
+        Whether an existing output may be replaced, and an unfinished run of it forgotten.
+    resume : bool
+        Continue an unfinished run of the same inputs and options; begin where there is none; do nothing when the product is complete.
+    scheduler : str
+        ``threads``, ``processes``, or the address of a dask.distributed scheduler, whose workers must see the same files.
+    workers : int, optional
+        Threads or processes; one for each core by default.
     stage : callable
-        Told the name of each stage as it begins, and its number of samples.
+        Told the name of each stage as it begins, how much is to be done in it, and how much is done.
 
     Returns
     -------
     Path
         The file written.
-    """
-    from gyrostab.davar import davar
-    from gyrostab.export import to_netcdf
-    from gyrostab.fit import fit_noise
 
-    target = check_output(output, suffixes=[".nc"], overwrite=overwrite, inputs=paths)
-    check_windows(**(windows or {}))
-    stage("reading", 0)
-    log = load_log(paths, **(reading or {}))
-    stage("computing", samples_of(log))
-    surface = davar(log, **(windows or {}))
-    to_netcdf(fit_noise(surface, **(fitting or {})), target, overwrite=overwrite)
-    stage("checking", 0)
-    _note_constant(target)
+    Raises
+    ------
+    ResumeError
+        When an unfinished run is in the way, cannot be continued as asked, or is being worked on by another process.
+    WorkerError
+        When the workers cannot do the work.
+    OutputError, OptionError, FormatError
+        For an output, an option or an input that is wrong; the message says whether finished parts are kept.
+    KeyboardInterrupt
+        When interrupted; its message says how much is done.
+    """
+    scheduler = check_scheduler(scheduler)
+    target = check_output(output, suffixes=[".nc"], overwrite=True, inputs=paths)
+    fitting = None if surface_only else dict(fitting or {})
+    options: dict[str, Any] = {"reading": dict(reading or {}), "windows": dict(windows or {}), "fitting": fitting}
+    check_windows(**options["windows"])
+    job = _describe(paths, target, options)
+    blocks: Blocks = {}
+    with hold(job.folder):
+        try:
+            begun = _look(job, resume=resume, overwrite=overwrite)
+            if begun.complete:
+                warnings.warn(f"{target} is complete already", stacklevel=2)
+            else:
+                with open_pool(scheduler, workers=workers, files=job.files) as pool:
+                    _compute(job, blocks, paths, begun=begun, pool=pool, stage=stage)
+                _write(job, blocks, overwrite=begun.overwrite, stage=stage)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(_kept(job, "interrupted")) from stop
+        except GyrostabError as error:
+            if is_begun(job.folder) and not isinstance(error, ResumeError):
+                raise type(error)(_kept(job, str(error))) from error
+            raise
+        finally:
+            if not is_begun(job.folder):
+                remove_job(job.folder, output=target)
+        remove_job(job.folder, output=target)
     return target
 
 
-def _note_constant(path: Path) -> None:
-    """Warn of windows in which an axis never moved: the Allan variance is zero at the shortest and the longest tau."""
-    from gyrostab.export import open_product
+class _Job(NamedTuple):
+    """What a run is asked for."""
 
-    with open_product(path) as product:
-        still = (product["avar"].isel(tau=[0, -1]) == 0.0).all("tau").compute()
-    for axis in still["axis"].values:
-        share = float(still.sel(axis=axis).mean())
+    target: Path
+    folder: Path
+    files: list[Path]
+    fingerprint: dict[str, Any]
+    name: str
+    options: dict[str, Any]
+
+
+class _Begun(NamedTuple):
+    """What there is of it already."""
+
+    complete: bool
+    fresh: bool
+    overwrite: bool
+
+
+def _describe(paths: Sequence[str | Path], target: Path, options: dict[str, Any]) -> _Job:
+    from gyrostab.read.files import expand
+
+    extra = options["reading"].get("channel", ())
+    files = expand(paths) + (expand(extra) if extra else [])
+    plain = {**options["reading"], "channel": None, **options["windows"], **{f"fit {k}": v for k, v in (options["fitting"] or {}).items()}}
+    fingerprint = make_fingerprint(files, {**plain, "fit": "left out" if options["fitting"] is None else None})
+    return _Job(target, folder_of(target), files, fingerprint, digest(fingerprint), options)
+
+
+def _look(job: _Job, *, resume: bool, overwrite: bool) -> _Begun:
+    """Find out how far the job is, and refuse what would destroy something or mix two jobs."""
+    before, kept = read_job(job.folder), is_begun(job.folder)
+    if resume and _made_by(job.target) == job.name:
+        return _Begun(complete=True, fresh=False, overwrite=False)
+    if before and kept and not (resume or overwrite):
+        raise ResumeError(_kept(job, f"{job.target}: a run of it was begun and not finished") + ", --overwrite starts anew")
+    said = differences(before, job.fingerprint) if before else ""
+    if resume and kept and said:
+        raise ResumeError(
+            f"{job.target}: the run that was begun cannot be continued, because {said}; put that back, "
+            "or give --overwrite in place of --resume to start anew"
+        )
+    again = bool(resume and before and not said)
+    overwrite = overwrite or bool(before and again and before["overwrite"])
+    if job.target.exists() and resume and not overwrite:
+        raise OutputError(
+            f"output {str(job.target)!r} exists already, and is not the product of these logs and options; "
+            "give --overwrite to replace it, or another name with -o"
+        )
+    check_output(job.target, overwrite=overwrite)
+    return _Begun(complete=False, fresh=not again, overwrite=overwrite)
+
+
+def _made_by(path: Path) -> str | None:
+    """Digest of the job that made a product; None for anything else."""
+    if not path.is_file():
+        return None
+    import netCDF4
+
+    try:
+        with netCDF4.Dataset(path) as file:
+            return str(file.getncattr("gyrostab_job"))
+    except (OSError, AttributeError):
+        return None
+
+
+def _kept(job: _Job, what: str) -> str:
+    """A message with what is done and how to go on."""
+    kept, before = kept_parts(job.folder), read_job(job.folder)
+    if not before or not is_begun(job.folder):
+        return f"{what}; nothing was written under the name of the output. Start the same command again."
+    parts = before["parts"]
+    return f"{what}; {kept} of {parts} parts ({kept / parts:.0%}) are kept, and the same command with --resume continues"
+
+
+def _is_log(path: Path) -> bool:
+    """Whether a file is a log that gyrostab wrote, which every worker can open for itself."""
+    from gyrostab.export import open_log
+
+    try:
+        open_log(path).close()
+    except GyrostabError:
+        return False
+    return True
+
+
+def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _Begun, pool: Pool, stage: Stage) -> None:
+    """Compute what is missing of the job."""
+    from gyrostab.davar import davar_parts
+    from gyrostab.export import to_zarr
+
+    reading, windows, fitting = (job.options[name] for name in ("reading", "windows", "fitting"))
+    store = job.folder / "log.zarr"
+    if begun.fresh:
+        clear_job(job.folder)
+    remove_leftovers(job.target)
+    stage("reading", 0)
+    on_file = partial(_say_file, stage)
+    log = load_log([store]) if store.exists() else load_log(paths, **reading, on_file=on_file)
+    parts = davar_parts(log, **windows)
+    begin_job(job.folder, job.fingerprint, parts=len(parts), overwrite=begun.overwrite)
+    blocks.update(find_blocks(job.folder, parts, job=job.name))
+    axis = windows.get("axis")
+    total = log.sizes["time"] * (log.sizes["axis"] if axis is None else 1 if isinstance(axis, str) else len(axis))
+
+    def advance(count: int) -> None:
+        stage("computing", total, total * sum(block.part.stop - block.part.start for block in blocks.values()) // parts[-1].stop)
+
+    call: tuple[Any, ...] = (_part_of_log, log, windows, fitting)
+    if pool.remote and len(blocks) < len(parts):
+        source = {**reading, "paths": _absolute(paths), "channel": _absolute(reading.get("channel", ()))}
+        if not store.exists() and not any(map(_is_log, job.files)):  # some may be damaged; the two kinds do not mix
+            stage("storing", 0)
+            to_zarr(log, store)
+        if store.exists():
+            source = {"paths": _absolute([store])}
+        call = (_part_of_files, pool.share(json.dumps(source, default=str)), windows, fitting)
+    advance(0)
+    compute_blocks(job.folder, parts, blocks, job=job.name, pool=pool, call=call, check=partial(_check_inputs, job), advance=advance)
+
+
+def _say_file(stage: Stage, number: int, count: int, path: Path) -> None:
+    stage("reading", count, number - 1, "files")
+
+
+def _check_inputs(job: _Job) -> None:
+    now = {**job.fingerprint, "inputs": describe_inputs(job.files)}
+    if said := differences(job.fingerprint, now):
+        raise FormatError(f"{said}; a log must not change while it is read: put it back")
+
+
+def _absolute(paths: Sequence[str | Path]) -> list[str]:
+    return [os.path.abspath(path) for path in paths]
+
+
+def _part_of_log(log: xr.Dataset, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice) -> xr.Dataset:
+    return compute_part(log, part, windows, fitting)
+
+
+def _part_of_files(source: str, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice) -> xr.Dataset:
+    """In another process: open the log there, once, so that only names travel."""
+    return compute_part(_opened(source), part, windows, fitting)
+
+
+@lru_cache(maxsize=1)
+def _opened(source: str) -> xr.Dataset:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the process that sent us here has said it
+        return load_log(**json.loads(source))
+
+
+def _write(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) -> None:
+    """Write the product, and warn of windows in which an axis never moved."""
+    product = write_blocks(blocks, job.target, attrs={"gyrostab_job": job.name}, overwrite=overwrite, stage=stage)
+    stage("checking", 0)
+    for axis, share in share_constant(product).items():
         if share > 0.0:
             warnings.warn(
                 f"gyro axis {axis} is constant in {share:.0%} of the windows: is the sensor stuck, or its column a filler?", stacklevel=2

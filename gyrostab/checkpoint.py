@@ -1,0 +1,228 @@
+"""Finished parts of a product as files: each is whole or is not trusted, and all together read as one dataset.
+
+A block file holds, one after the other, a magic word, the length of a header, the header as JSON, the arrays as they stand in
+memory, and the SHA-256 of everything before. It is written under another name, brought to the disk and only then renamed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.output import new_output
+
+__all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
+
+_MAGIC = b"GYROBLK1"
+_ALIGN = 64
+_CHUNK = 2**17  # values in one compressed chunk of a product: `gyrostab.export`
+
+
+class Block(NamedTuple):
+    """A finished part of a product on disk.
+
+    Attributes
+    ----------
+    path : pathlib.Path
+        Block file.
+    part : slice
+        Windows that it holds.
+    header : dict
+        Dimensions, dtypes, shapes, places and attributes of its variables.
+    begin : int
+        Byte at which the arrays begin.
+    """
+
+    path: Path
+    part: slice
+    header: dict[str, Any]
+    begin: int
+
+
+def block_path(folder: Path, part: slice) -> Path:
+    """Name of the block file of a part."""
+    return folder / f"windows-{part.start:010d}.block"
+
+
+def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> Block:
+    """Write a part of a product, complete or not at all.
+
+    Parameters
+    ----------
+    folder : Path
+        Job folder.
+    part : slice
+        Windows of the part.
+    dataset : xarray.Dataset
+        The part, in memory.
+    job : str
+        Digest of inputs and options; a block of another job is not trusted.
+
+    Returns
+    -------
+    Block
+        What `find_blocks` would find.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written, with the reason.
+    """
+    arrays = {str(name): np.ascontiguousarray(variable.values) for name, variable in dataset.variables.items()}
+    described, place = {}, 0
+    for name, values in arrays.items():
+        attrs = _to_json(dataset[name].attrs)
+        described[name] = {
+            "dims": list(dataset[name].dims), "dtype": values.dtype.str, "shape": list(values.shape), "place": place, "attrs": attrs,
+        }  # fmt: skip
+        place += -(-values.nbytes // _ALIGN) * _ALIGN
+    header = {
+        "job": job, "part": [part.start, part.stop], "coords": [str(name) for name in dataset.coords], "attrs": _to_json(dataset.attrs),
+        "variables": described,
+    }  # fmt: skip
+    text = json.dumps(header).encode()
+    head = (_MAGIC + len(text).to_bytes(8, "little") + text).ljust(_begin(len(text)), b"\0")
+    path = block_path(folder, part)
+    with new_output(path, overwrite=True) as temporary, temporary.open("wb", buffering=0) as file:
+        digest = hashlib.sha256()
+        for piece in (head, *(piece for values in arrays.values() for piece in (values, bytes(-values.nbytes % _ALIGN)))):
+            view = memoryview(piece) if isinstance(piece, bytes) else piece.reshape(-1).view(np.uint8).data
+            digest.update(view)
+            _write_all(file, view)
+        _write_all(file, memoryview(digest.digest()))
+    return Block(path, part, header, len(head))
+
+
+def _begin(text: int) -> int:
+    """Place of the arrays after a header of so many bytes."""
+    return -(-(16 + text) // _ALIGN) * _ALIGN
+
+
+def _write_all(file: Any, view: memoryview) -> None:
+    while view.nbytes:
+        view = view[file.write(view) :]
+
+
+def find_blocks(folder: Path, parts: Sequence[slice], *, job: str) -> dict[int, Block]:
+    """Find the finished parts that are whole and belong to the job, by their number in `parts`.
+
+    A block that is cut short, altered, or of another job is left out, so that it is computed again.
+    """
+    found = {}
+    for number, part in enumerate(parts):
+        path = block_path(folder, part)
+        text = _verified(path)
+        header = json.loads(text) if text else {}
+        if header and header["job"] == job and header["part"] == [part.start, part.stop]:
+            found[number] = Block(path, part, header, _begin(len(text)))
+    return found
+
+
+def _verified(path: Path) -> bytes:
+    """Header of a block file; nothing when it is not there or its checksum is wrong."""
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size - hashlib.sha256().digest_size
+            start = file.read(16)
+            if size < 16 or start[:8] != _MAGIC:
+                return b""
+            digest, left = hashlib.sha256(start), size - 16
+            text = file.read(min(int.from_bytes(start[8:], "little"), left))
+            digest.update(text)
+            left -= len(text)
+            while left > 0 and (piece := file.read(min(left, 2**20))):
+                digest.update(piece)
+                left -= len(piece)
+            if left or file.read() != digest.digest():
+                return b""
+            return text
+    except OSError:
+        return b""
+
+
+def assemble(blocks: Sequence[Block]) -> xr.Dataset:
+    """Put blocks together to one dataset, whose long variables are read from the files when they are used.
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+        All parts, in order.
+
+    Returns
+    -------
+    xarray.Dataset
+        The product: coordinates in memory, the rest dask arrays in the chunks of the file that will be written.
+    """
+    first = blocks[0].header
+    variables: dict[str, xr.Variable] = {}
+    for name, described in first["variables"].items():
+        dims, attrs = tuple(described["dims"]), _from_json(described["attrs"])
+        if "time" not in dims:
+            data = _section(blocks[0], name)
+        elif name in first["coords"]:
+            data = np.concatenate([_section(block, name) for block in blocks], axis=dims.index("time"))
+        else:
+            data = _lazily(blocks, name)
+        variables[name] = xr.Variable(dims, data, attrs)
+    whole = xr.Dataset(variables, attrs=_from_json(first["attrs"]))
+    return whole.set_coords(first["coords"])
+
+
+def _section(block: Block, name: str) -> NDArray[Any]:
+    """One variable of a block, mapped."""
+    described = block.header["variables"][name]
+    dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
+    if 0 in shape:
+        return np.empty(shape, dtype)
+    return np.memmap(block.path, dtype=dtype, mode="r", offset=block.begin + described["place"], shape=shape)
+
+
+def _lazily(blocks: Sequence[Block], name: str) -> Any:
+    """A variable along time as a dask array that reads the block files."""
+    import dask.array as da
+
+    described = blocks[0].header["variables"][name]
+    along = described["dims"].index("time")
+    edges = np.cumsum([0, *(block.part.stop - block.part.start for block in blocks)])
+    shape = [int(edges[-1]) if i == along else size for i, size in enumerate(described["shape"])]
+    dims = list(zip(described["dims"], shape, strict=True))
+    inner = int(np.prod([size for dim, size in dims if dim not in ("axis", "term", "time")]))
+    sizes = {"axis": 1, "term": 1, "time": max(1, min(shape[along], _CHUNK // max(1, inner)))}
+
+    def read(block_info: Mapping[Any, Any]) -> NDArray[Any]:
+        location = block_info[None]["array-location"]
+        begin, end = location[along]
+        pieces = []
+        for i in range(int(np.searchsorted(edges, begin, side="right")) - 1, int(np.searchsorted(edges, end, side="left"))):
+            where = [slice(*ends) for ends in location]
+            where[along] = slice(max(0, begin - int(edges[i])), min(end, int(edges[i + 1])) - int(edges[i]))
+            pieces.append(np.array(_section(blocks[i], name)[tuple(where)]))
+        return np.concatenate(pieces, axis=along)
+
+    chunks = da.core.normalize_chunks([sizes.get(dim, size) for dim, size in dims], shape=tuple(shape))
+    return da.map_blocks(read, chunks=chunks, dtype=np.dtype(described["dtype"]), meta=np.empty((0,) * len(shape), described["dtype"]))
+
+
+def _to_json(attrs: Mapping[Any, Any]) -> dict[str, Any]:
+    """Attributes as JSON holds them; arrays and numpy scalars are marked, so that they come back as they were."""
+    plain: dict[str, Any] = {}
+    for name, value in attrs.items():
+        array = isinstance(value, np.ndarray | np.generic)
+        plain[str(name)] = {"dtype": value.dtype.str, "shape": list(value.shape), "values": value.tolist()} if array else value
+    return plain
+
+
+def _from_json(plain: Mapping[str, Any]) -> dict[str, Any]:
+    attrs: dict[str, Any] = {}
+    for name, value in plain.items():
+        marked = isinstance(value, dict) and value.keys() == {"dtype", "shape", "values"}
+        attrs[name] = np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])[()] if marked else value
+    return attrs

@@ -1,0 +1,103 @@
+"""What can be found wrong before the long work starts."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from gyrostab.errors import OptionError, OutputError
+
+__all__ = ["check_output", "check_windows"]
+
+
+def check_output(path: str | Path, *, suffixes: Sequence[str] = (), overwrite: bool = False, inputs: Iterable[str | Path] = ()) -> Path:
+    """Make sure, before the long work starts, that a result can be written.
+
+    Parameters
+    ----------
+    path : str or Path
+        File (or Zarr folder) to be written.
+    suffixes : sequence of str
+        Endings that the stage can write, with the dot; empty for any.
+    overwrite : bool
+        Whether an existing output may be replaced.
+    inputs : iterable of path
+        Files that are read, which the output must not replace.
+
+    Returns
+    -------
+    Path
+        The path.
+
+    Raises
+    ------
+    OptionError
+        When the name has the wrong ending, or is an input.
+    OutputError
+        When the output exists and `overwrite` is not given, or its folder cannot be written to.
+
+    Examples
+    --------
+    >>> check_output("product.txt", suffixes=[".nc"])
+    Traceback (most recent call last):
+    gyrostab.errors.OptionError: output 'product.txt' must end in .nc; give another name with -o
+    """
+    path = Path(path)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise OptionError(f"output {str(path)!r} must end in {' or '.join(suffixes)}; give another name with -o")
+    if any(Path(item).resolve() == path.resolve() for item in inputs):
+        raise OptionError(f"output {str(path)!r} is also an input and would be destroyed; give another name with -o")
+    if path.is_dir() and path.suffix.lower() != ".zarr":
+        raise OutputError(f"output {str(path)!r} is a directory; give another name with -o")
+    if path.is_file() and path.suffix.lower() == ".zarr":
+        raise OutputError(f"output {str(path)!r} is a file, and Zarr needs a directory; give another name with -o")
+    if path.exists() and not overwrite:
+        raise OutputError(f"output {str(path)!r} exists already; give --overwrite to replace it, or another name with -o")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise OutputError(f"output {str(path)!r}: nothing can be written in {str(path.parent)!r} ({error.strerror})") from error
+    return path
+
+
+def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau_max: str | None = None, **other: Any) -> None:
+    """Make sure, before the long work starts, that the lengths of time can be read at all.
+
+    Parameters
+    ----------
+    window, step, taus, tau_max : str
+        Options of `gyrostab.davar.davar`, as text; others are passed over.
+
+    Raises
+    ------
+    OptionError
+        When one of them is no length of time, or the step or an averaging time is too long for the window.
+
+    Examples
+    --------
+    >>> check_windows(window="10", step="1min")
+    Traceback (most recent call last):
+    gyrostab.errors.OptionError: window '10' has no unit; write for instance 10s, 10min or 10samples
+    """
+    from gyrostab.windows import averaging_factors, duration_seconds, samples
+
+    fine = 1e6  # Hz; the true rate is not known yet
+    length, hop = samples(window, fine, "window"), samples(step, fine, "step") if step else 1
+    if step and ("sample" in window) == ("sample" in step) and hop > length:
+        raise OptionError(f"the step of {step} is longer than the window of {window}, so samples would be left out; give a shorter --step")
+    half = None if "sample" in window else length / fine / 2  # how long a number of samples is depends on the rate
+    given = [tau_max] if tau_max else []
+    if taus.strip().isdigit():
+        averaging_factors(taus, rate=fine, window=2)
+    elif taus.strip() not in ("octave", "all"):
+        given += taus.split(",")
+    for tau in given:
+        if duration_seconds(tau, "tau") > (half or math.inf):
+            raise OptionError(
+                f"tau {tau.strip()} is longer than half of the window of {window}, so no second difference fits; "
+                "give a longer --window or a shorter tau"
+            )

@@ -1,0 +1,109 @@
+"""What the command line needs beside its commands: defaults from a file, notes and errors in one line, a polite way to stop."""
+
+from __future__ import annotations
+
+import errno
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+from cyclopts import CycloptsError
+
+from gyrostab.errors import GyrostabError, OptionError
+from gyrostab.options import read_toml
+
+__all__ = ["complain", "explain", "plain_notes", "read_config", "stoppable"]
+
+
+def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
+    """Reader of the option defaults in the file that ``--config`` names, for cyclopts; None without one."""
+    name = None
+    for place, token in enumerate(tokens):
+        if token == "--config" and place + 1 < len(tokens):
+            name = tokens[place + 1]
+        elif token.startswith("--config="):
+            name = token.removeprefix("--config=")
+    if name is None:
+        return None
+    table = read_toml(Path(name))
+    strange = [key for key, value in table.items() if isinstance(value, dict) and key not in commands]
+    if strange:
+        raise OptionError(f"{name}: table [{strange[0]}] is not a command; the commands are {', '.join(commands)}")
+
+    def apply(current: Any, path: tuple[str, ...], arguments: Any) -> None:
+        from cyclopts.config import Dict
+
+        defaults = {key: value for key, value in table.items() if not isinstance(value, dict)}
+        defaults |= table.get(path[0], {}) if path else {}
+        for key, value in defaults.items():
+            if isinstance(value, dict):  # [run.map] wx = "gyro_x"
+                defaults[key] = [f"{left}={right}" for left, right in value.items()]
+        Dict(defaults, source=name, use_commands_as_keys=False)(current, path, arguments)
+
+    return apply
+
+
+@contextmanager
+def plain_notes() -> Iterator[None]:
+    """Show each warning of the package once, as one plain line."""
+    seen: set[str] = set()
+
+    def show(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None, line: str | None = None
+    ) -> None:
+        text = str(message)
+        if text not in seen:
+            seen.add(text)
+            print(f"note: {text}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """Let a polite ``kill``, a time limit or a closed terminal end the work as Ctrl-C does, with nothing left behind."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    ours = [number for number in signals if signal.getsignal(number) is signal.SIG_DFL]  # not under nohup
+    if threading.current_thread() is not threading.main_thread():
+        ours = []
+    for number in ours:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def complain(text: str, code: int) -> int:
+    """Say what is wrong; the exit code."""
+    print(f"gyrostab: {text}", file=sys.stderr)
+    return code
+
+
+def explain(error: Exception) -> int:
+    """One message for an error, and the exit code."""
+    if isinstance(error, CycloptsError):
+        return complain(f"{error} See gyrostab --help, or the command's own --help.", 2)
+    if isinstance(error, GyrostabError):
+        return complain(str(error), 2)
+    if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError) and error.filename:
+        return complain(f"{error.filename}: {error.strerror}", 2)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        where = error.filename or "the standard output"
+        return complain(f"{where}: cannot be written ({error.strerror}); make room, or write elsewhere", 2)
+    if isinstance(error, MemoryError):
+        return complain(f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers", 1)
+    return complain(f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.", 1)

@@ -1,0 +1,134 @@
+"""The long work in parts: computed side by side, in any order, each one kept on disk as soon as it is certain; then written as one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.checkpoint import Block, assemble, write_block
+from gyrostab.davar import davar_part
+from gyrostab.export import to_netcdf
+from gyrostab.fit import fit_noise
+from gyrostab.progress import Stage
+from gyrostab.schedule import Pool, in_any_order
+
+__all__ = ["Blocks", "compute_blocks", "compute_part", "share_constant", "write_blocks"]
+
+#: Finished parts by their number.
+Blocks = dict[int, Block]
+_HELD_SECONDS, _HELD_BYTES = 1.0, 2**26  # results wait so long at most until the inputs are looked at again
+
+
+def compute_part(log: xr.Dataset, part: slice, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None) -> xr.Dataset:
+    """Some windows of a product (or of a surface, where `fitting` is None), at once and in the calling thread."""
+    surface = davar_part(log, part=part, **windows)
+    if fitting is None:
+        return surface
+    if fitting.get("method") == "adev":
+        return fit_noise(surface, **fitting)
+    return fit_noise(surface.chunk(), **fitting).compute(scheduler="synchronous")
+
+
+def compute_blocks(
+    folder: Path,
+    parts: Sequence[slice],
+    blocks: Blocks,
+    *,
+    job: str,
+    pool: Pool,
+    call: Sequence[Any],
+    check: Callable[[], None],
+    advance: Callable[[int], None],
+) -> None:
+    """Compute the parts that are missing and write each to its block file.
+
+    Parameters
+    ----------
+    folder : Path
+        Job folder.
+    parts : sequence of slice
+        All parts.
+    blocks : dict
+        Finished parts; those that are computed are added, so that it says what is done even after an error.
+    job : str
+        Digest of the job.
+    pool : Pool
+        Where the work is done.
+    call : sequence
+        Function and its first arguments; the part follows.
+    check : callable
+        Raises when an input has changed. No result is written before a check that came after it.
+    advance : callable
+        Told how many parts are done.
+    """
+    missing = [number for number in range(len(parts)) if number not in blocks]
+    held: list[tuple[int, xr.Dataset]] = []
+    last = time.monotonic()
+
+    def keep() -> None:
+        nonlocal last
+        if held:
+            check()
+        while held:
+            number, result = held.pop()
+            blocks[number] = write_block(folder, parts[number], result, job=job)
+        advance(len(blocks))
+        last = time.monotonic()
+
+    function, *arguments = call
+    numbers = {parts[number].start: number for number in missing}
+    try:
+        for done, result in in_any_order(pool, ((function, *arguments, parts[number]) for number in missing)):
+            held.append((numbers[done[-1].start], result))
+            if time.monotonic() - last > _HELD_SECONDS or sum(one.nbytes for _, one in held) > _HELD_BYTES:
+                keep()
+    except BaseException as error:
+        if isinstance(error, Exception):
+            check()  # an input that has vanished explains more than what reading it said
+        keep()
+        raise
+    keep()
+
+
+def write_blocks(blocks: Blocks, target: Path, *, attrs: Mapping[str, Any], overwrite: bool, stage: Stage) -> xr.Dataset:
+    """Write all blocks as one NetCDF file, always in the same order, so that the same numbers make the same bytes.
+
+    Returns
+    -------
+    xarray.Dataset
+        What was written, still reading from the blocks.
+    """
+    import dask
+
+    whole = assemble([blocks[number] for number in sorted(blocks)]).assign_attrs(attrs)
+    variables = sum(variable.chunks is not None for variable in whole.variables.values())
+    done = 0
+
+    def in_order(graph: Any, keys: Any, **options: Any) -> Any:
+        nonlocal done
+        tasks = graph if isinstance(graph, Mapping) else dict(graph.__dask_graph__())
+        if isinstance(keys, list):
+            results = []
+            for key in keys:
+                results.append(in_order(tasks, key))
+                done += 1
+                stage("writing", variables, min(done, variables), "variables")
+            return results
+        return dask.local.get_sync(dask.optimization.cull(tasks, [keys])[0], keys)
+
+    stage("writing", variables, 0, "variables")
+    with dask.config.set(scheduler=in_order):
+        to_netcdf(whole, target, overwrite=overwrite)
+    return whole
+
+
+def share_constant(product: xr.Dataset) -> dict[str, float]:
+    """Share of the windows in which an axis never moved: the Allan variance is zero at the shortest and the longest tau."""
+    ends = product["avar"].isel(tau=[0, -1])
+    still = (ends == 0.0).all("tau").mean("time").compute(scheduler="synchronous")
+    return {str(axis): float(share) for axis, share in zip(np.atleast_1d(still["axis"].values), np.atleast_1d(still.values), strict=True)}

@@ -1,0 +1,269 @@
+"""The folder of a run beside its output: what the run was asked for, what is finished, and who works on it.
+
+``.PRODUCT.nc.job/`` holds ``job.json`` (inputs, options, versions), a file for each finished block (`gyrostab.checkpoint`) and
+``lock``. ``job.json`` is there before the first block and is removed first, so that blocks without it are leftovers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gyrostab.errors import ResumeError
+from gyrostab.output import new_output
+
+__all__ = [
+    "begin_job",
+    "clear_job",
+    "describe_inputs",
+    "differences",
+    "digest",
+    "folder_of",
+    "hold",
+    "is_begun",
+    "kept_parts",
+    "make_fingerprint",
+    "read_job",
+    "remove_job",
+    "remove_leftovers",
+]
+
+_SCHEMA = "gyrostab.job/1"
+_SAID = 4  # differences that a message lists
+
+
+def folder_of(output: Path) -> Path:
+    """Folder of the run that makes `output`."""
+    return output.with_name(f".{output.name}.job")
+
+
+def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """Path, size [bytes] and time of change of each input; of a directory (Zarr) those of all its files together."""
+    return [{"path": os.path.abspath(path), **_described(path)} for path in paths]
+
+
+def _described(path: Path) -> dict[str, Any]:
+    try:
+        if not path.is_dir():
+            found = path.stat()
+            return {"bytes": found.st_size, "changed_ns": found.st_mtime_ns}
+        listing = sorted(_files_below(str(path), ""))
+    except OSError:
+        return {"bytes": None, "changed_ns": None}
+    return {
+        "bytes": sum(size for _, size, _ in listing),
+        "changed_ns": max((changed for *_, changed in listing), default=0),
+        "files": len(listing),
+        "listing": hashlib.sha256(json.dumps(listing).encode()).hexdigest(),
+    }
+
+
+def _files_below(folder: str, inside: str) -> Iterator[tuple[str, int, int]]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            name = f"{inside}{entry.name}"
+            if entry.is_dir():
+                yield from _files_below(entry.path, f"{name}/")
+            else:
+                found = entry.stat()
+                yield name, found.st_size, found.st_mtime_ns
+
+
+def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:
+    """All that the numbers of a product depend on: inputs in their order, options, versions and the machine's numbers."""
+    versions = {name: _version(name) for name in ("gyrostab", "numpy", "numba")}
+    return {
+        "inputs": describe_inputs(paths),
+        "options": json.loads(json.dumps({name: value for name, value in options.items() if value is not None}, default=str)),
+        "versions": {**versions, "byte order": sys.byteorder, "float": np.dtype(float).str, "processor": platform.machine()},
+    }
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def digest(fingerprint: Mapping[str, Any]) -> str:
+    """Short name of a fingerprint; where the inputs lie does not matter, but what they are called, their size and their time do."""
+    inputs = [{**item, "path": os.path.basename(item["path"])} for item in fingerprint["inputs"]]
+    return "sha256:" + hashlib.sha256(json.dumps({**fingerprint, "inputs": inputs}, sort_keys=True).encode()).hexdigest()
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """What differs between two fingerprints, in one line; empty when nothing does.
+
+    Examples
+    --------
+    >>> old = {"inputs": [{"path": "/run7/b.csv", "bytes": 120, "changed_ns": 0}], "options": {"window": "10min"}, "versions": {}}
+    >>> new = {"inputs": [{"path": "/run7/b.csv", "bytes": 100, "changed_ns": 5}], "options": {"window": "5min"}, "versions": {}}
+    >>> differences(old, new)
+    'run7/b.csv has changed: 100 bytes, was 120; window is 5min, was 10min'
+    """
+    said = _input_differences(before["inputs"], now["inputs"])
+    for kind in ("options", "versions"):
+        old, new = before[kind], now[kind]
+        said += [
+            f"{name} is {_option(new.get(name))}, was {_option(old.get(name))}" for name in {**old, **new} if old.get(name) != new.get(name)
+        ]
+    return "; ".join(said[:_SAID]) + (f"; and {len(said) - _SAID} more" if len(said) > _SAID else "")
+
+
+def _option(value: Any) -> str:
+    if value is None:
+        return "not given"
+    if isinstance(value, dict):
+        return ", ".join(f"{left}={right}" for left, right in value.items())
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _input_differences(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:
+    old, new = ({item["path"]: item for item in items} for items in (before, now))
+    said = [f"{_short(path)} is given now and was not before" for path in new if path not in old]
+    said += [f"{_short(path)} was given before and is not now" for path in old if path not in new]
+    for path in [path for path in new if path in old and new[path] != old[path]]:
+        size, was = new[path]["bytes"], old[path]["bytes"]
+        if size is None:
+            said.append(f"{_short(path)} has vanished")
+        elif size != was:
+            said.append(f"{_short(path)} has changed: {size} bytes, was {'missing' if was is None else was}")
+        elif new[path]["changed_ns"] != old[path]["changed_ns"]:
+            said.append(f"{_short(path)} has changed: written {_when(new[path])}, was {_when(old[path])}")
+        else:
+            said.append(f"{_short(path)} has changed: other files are in it")
+    if not said and list(old) != list(new):
+        said.append("the logs are given in another order")
+    return said
+
+
+def _short(path: str) -> str:
+    """Last folder and name of a file."""
+    return os.path.join(*Path(path).parts[-2:])
+
+
+def _when(item: Mapping[str, Any]) -> str:
+    return f"{datetime.fromtimestamp(item['changed_ns'] / 1e9, UTC):%Y-%m-%dT%H:%M:%S.%f}Z"
+
+
+@contextlib.contextmanager
+def hold(folder: Path) -> Iterator[None]:
+    """Be the only process that works in a job folder, which is made if it is not there.
+
+    The lock belongs to the process and ends with it, however it ends.
+
+    Raises
+    ------
+    ResumeError
+        When another process works in it.
+    """
+    if find_spec("fcntl") is None:  # no such locks on this system
+        folder.mkdir(exist_ok=True)
+        yield
+        return
+    handle = None
+    while handle is None:
+        folder.mkdir(exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # removed by the one who held it, just now
+            handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                _lock(handle, folder)
+                if not os.path.samestat(os.fstat(handle), os.stat(folder / "lock")):
+                    raise FileNotFoundError
+            except BaseException:
+                os.close(handle)
+                handle = None
+                raise
+    try:
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"process {os.getpid()} on {platform.node()}\n".encode("ascii", "replace"), 0)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _lock(handle: int, folder: Path) -> None:
+    import fcntl
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        who = os.pread(handle, 100, 0).decode("ascii", "replace").strip() or "another process"
+        raise ResumeError(f"{folder.name}: {who} is making this product now; wait for it, or stop it first") from None
+    except OSError:  # a file system without locks
+        return
+
+
+def read_job(folder: Path) -> dict[str, Any] | None:
+    """What a begun run was asked for; None when none was begun."""
+    try:
+        job: dict[str, Any] = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return job if job.get("schema") == _SCHEMA else None
+
+
+def begin_job(folder: Path, fingerprint: Mapping[str, Any], *, parts: int, overwrite: bool) -> None:
+    """Write what the run was asked for, before its first block."""
+    job = {"schema": _SCHEMA, "overwrite": overwrite, "parts": parts, **fingerprint}
+    with new_output(folder / "job.json", overwrite=True) as temporary:
+        temporary.write_text(json.dumps(job, indent=1), encoding="utf-8")
+
+
+def kept_parts(folder: Path) -> int:
+    """Count the finished parts in a job folder."""
+    return sum(name.endswith(".block") for name in _names(folder))
+
+
+def is_begun(folder: Path) -> bool:
+    """Whether a job folder holds work that is worth keeping: finished parts, or a store of the log."""
+    return (folder / "job.json").exists() and (kept_parts(folder) > 0 or "log.zarr" in _names(folder))
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)
+    except FileNotFoundError:
+        return []
+
+
+def clear_job(folder: Path) -> None:
+    """Forget the work in a job folder; the lock stays."""
+    (folder / "job.json").unlink(missing_ok=True)
+    for name in _names(folder):
+        if name == "lock":
+            continue
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name, ignore_errors=True)
+        else:
+            (folder / name).unlink(missing_ok=True)
+
+
+def remove_job(folder: Path, *, output: Path) -> None:
+    """Remove a job folder, and what a killed run left of its output under other names."""
+    clear_job(folder)
+    remove_leftovers(output)
+    (folder / "lock").unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+
+
+def remove_leftovers(output: Path) -> None:
+    """Remove what a killed run left of its output under another name; only whoever holds the job may."""
+    for path in output.parent.glob(f".{glob.escape(output.name)}.????????.part"):
+        path.unlink(missing_ok=True)

@@ -1,0 +1,263 @@
+"""Who does the work: threads of this process, processes of this machine, or the workers of a dask.distributed scheduler."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gyrostab.errors import GyrostabError, OptionError, WorkerError
+
+__all__ = ["Pool", "check_scheduler", "in_any_order", "open_pool"]
+
+_TIMEOUT = 20.0  # s, for a scheduler to answer and for a first worker to come
+_PATIENCE = 60.0  # s without any worker
+_RETRIES = 5  # deaths of workers on one and the same part
+
+
+class Pool(NamedTuple):
+    """Where calls are sent.
+
+    Attributes
+    ----------
+    submit : callable
+        ``submit(function, *arguments)`` gives a `concurrent.futures.Future`.
+    width : callable
+        Number of calls that can run side by side now.
+    remote : bool
+        Other processes do the work: functions and arguments are pickled.
+    share : callable
+        Makes of an argument of many calls what is to be passed instead, so that it travels once.
+    """
+
+    submit: Callable[..., Future[Any]]
+    width: Callable[[], int]
+    remote: bool
+    share: Callable[[Any], Any]
+
+
+def check_scheduler(scheduler: str) -> str:
+    """Make sure that a scheduler is named rightly.
+
+    Parameters
+    ----------
+    scheduler : str
+        ``threads``, ``processes``, or the address of a dask.distributed scheduler.
+
+    Returns
+    -------
+    str
+        The same, with the protocol put before an address without one.
+
+    Raises
+    ------
+    OptionError
+        When it is none of these.
+
+    Examples
+    --------
+    >>> check_scheduler("cluster.example:8786")
+    'tcp://cluster.example:8786'
+    """
+    if scheduler in ("threads", "processes") or "://" in scheduler:
+        return scheduler
+    if ":" in scheduler:
+        return f"tcp://{scheduler}"
+    raise OptionError(
+        f"--scheduler {scheduler!r}: give threads, processes, or the address of a dask scheduler such as tcp://127.0.0.1:8786"
+    )
+
+
+@contextlib.contextmanager
+def open_pool(scheduler: str, *, workers: int | None = None, files: Sequence[Path] = ()) -> Iterator[Pool]:
+    """Open threads, processes, or a connection to a scheduler, for the length of the ``with`` block.
+
+    Parameters
+    ----------
+    scheduler : str
+        From `check_scheduler`.
+    workers : int, optional
+        Threads or processes; one for each core by default. A dask.distributed scheduler has its own.
+    files : sequence of Path
+        Files that every worker of dask.distributed must see under the same name.
+
+    Yields
+    ------
+    Pool
+        Calls that wait are dropped when the block is left.
+
+    Raises
+    ------
+    WorkerError
+        When the scheduler does not answer, has no workers, or a worker lacks gyrostab or the files.
+    OptionError
+        When dask.distributed is not installed.
+    """
+    if scheduler in ("threads", "processes"):
+        from dask.system import CPU_COUNT
+
+        count = workers or CPU_COUNT
+        executor = ThreadPoolExecutor(count) if scheduler == "threads" else _processes(count)
+        try:
+            yield Pool(executor.submit, lambda: count, scheduler == "processes", _same)
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+    else:
+        with _cluster(scheduler, files) as pool:
+            yield pool
+
+
+def _processes(count: int) -> Any:
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    return ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_process, initargs=(os.getpid(),))
+
+
+def _begin_process(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and end with it, even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+    warnings.showwarning = lambda message, *_: None  # the parent opens the same files and says the same
+
+
+@contextlib.contextmanager
+def _cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
+    try:
+        from distributed import Client
+    except ImportError:
+        advice = "install it with pip install 'gyrostab[distributed]'"
+        raise OptionError(f"--scheduler {address}: this needs dask.distributed; {advice}") from None
+    try:
+        client = Client(address, timeout=_TIMEOUT, set_as_default=False, name="gyrostab")
+    except (OSError, ValueError, TimeoutError) as error:
+        raise WorkerError(
+            f"--scheduler {address}: no dask scheduler answers there ({error}); start one with 'dask scheduler', or correct the address"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_TIMEOUT)
+        except TimeoutError as error:
+            raise WorkerError(
+                f"--scheduler {address}: the scheduler has no workers; start some with 'dask worker {address} --nthreads 1'"
+            ) from error
+        _check_workers(client, address, files)
+        executor = client.get_executor(pure=False, retries=_RETRIES)
+        try:
+            threads = lambda: sum(client.nthreads().values())  # noqa: E731
+            yield Pool(executor.submit, threads, True, partial(client.submit, _same, pure=False))
+        finally:
+            executor.shutdown(wait=False)
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
+    """Let every worker look for the files; a worker elsewhere has another disk, and another gyrostab perhaps."""
+    sizes = {os.path.abspath(path): _size(path) for path in files}
+    found = client.run(_look, list(sizes), on_error="return")
+    from gyrostab import __version__
+
+    for worker, answer in found.items():
+        if isinstance(answer, BaseException):
+            raise WorkerError(
+                f"--scheduler {address}: worker {worker} cannot run gyrostab ({type(answer).__name__}: {answer}); "
+                f"install gyrostab {__version__} there too"
+            )
+        version, seen = answer
+        if version != __version__:
+            raise WorkerError(f"--scheduler {address}: worker {worker} has gyrostab {version}, here it is {__version__}; install the same")
+        for path, size in sizes.items():
+            if seen[path] != size:
+                what = "does not see" if seen[path] is None else "sees another file under the name of"
+                raise WorkerError(
+                    f"--scheduler {address}: worker {worker} {what} {path}; all workers need the same file system under the same names"
+                )
+
+
+def _look(paths: Sequence[str]) -> tuple[str, dict[str, int | None]]:
+    from gyrostab import __version__
+
+    return __version__, {path: _size(path) for path in paths}
+
+
+def _size(path: str | Path) -> int | None:
+    """Size of a file; of a directory only that it is there; None when nothing is."""
+    try:
+        return 0 if os.path.isdir(path) else os.stat(path).st_size
+    except OSError:
+        return None
+
+
+def in_any_order(pool: Pool, calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Make calls side by side, few more at a time than can run, and give each back with its result as it comes.
+
+    Parameters
+    ----------
+    pool : Pool
+        Where they run.
+    calls : iterable of tuple
+        Function and its arguments.
+
+    Yields
+    ------
+    call, result
+
+    Raises
+    ------
+    WorkerError
+        When the workers have died, or the scheduler is gone; whatever a call raised, too.
+    """
+    waiting: dict[Future[Any], tuple[Any, ...]] = {}
+    rest = iter(calls)
+    idle_since = time.monotonic()
+    try:
+        while True:
+            most = 2 * pool.width() if pool.remote else pool.width() + 1
+            for call in itertools.islice(rest, max(0, most - len(waiting))):
+                waiting[pool.submit(*call)] = call
+            if not waiting and most:
+                return
+            done, _ = wait(waiting, timeout=1.0, return_when=FIRST_COMPLETED)
+            if done or pool.width():
+                idle_since = time.monotonic()
+            elif time.monotonic() - idle_since > _PATIENCE:
+                raise WorkerError(f"the scheduler has had no worker for {_PATIENCE:.0f} s; start workers again")
+            for future in done:
+                yield waiting.pop(future), _result(future)
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def _result(future: Future[Any]) -> Any:
+    try:
+        return future.result()
+    except GyrostabError:
+        raise
+    except BrokenProcessPool as error:
+        raise WorkerError("a worker process has died: is the memory enough? Give fewer --workers") from error
+    except CancelledError as error:
+        raise WorkerError("the connection to the dask scheduler was lost") from error
+    except Exception as error:
+        if type(error).__name__ == "KilledWorker":
+            raise WorkerError(f"the workers died again and again on the same part ({error}); is their memory enough?") from error
+        raise
