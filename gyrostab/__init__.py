@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from gyrostab.regularise import regularise as regularise
     from gyrostab.report import write_report as write_report
     from gyrostab.scan import scan as scan
+    from gyrostab.simulate import make_noise as make_noise
+    from gyrostab.simulate import read_model as read_model
+    from gyrostab.simulate import simulate as simulate
 
 # public name -> module that holds it
 _HOME = {
@@ -51,6 +54,7 @@ _HOME = {
     "fit_noise": "fit",
     "gap_table": "regularise",
     "make_log": "log",
+    "make_noise": "simulate",
     "open_log": "export",
     "open_product": "export",
     "open_surface": "export",
@@ -62,9 +66,11 @@ _HOME = {
     "plot_signal": "plot",
     "read_channel": "read",
     "read_log": "read",
+    "read_model": "simulate",
     "regularise": "regularise",
     "save_figures": "plot",
     "scan": "scan",
+    "simulate": "simulate",
     "to_kalibr": "kalibr",
     "to_netcdf": "export",
     "to_zarr": "export",
@@ -79,6 +85,7 @@ __all__ = [
     "fit_noise",
     "gap_table",
     "make_log",
+    "make_noise",
     "open_log",
     "open_product",
     "open_surface",
@@ -90,9 +97,11 @@ __all__ = [
     "plot_signal",
     "read_channel",
     "read_log",
+    "read_model",
     "regularise",
     "save_figures",
     "scan",
+    "simulate",
     "to_kalibr",
     "to_netcdf",
     "to_zarr",

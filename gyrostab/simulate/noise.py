@@ -143,7 +143,7 @@ def shape(
     carry : dict
         To be given to the next call.
     """
-    total: Array = ramp * (units.first + 0.5 + np.arange(units.size)) / (HOUR * rate)
+    total: Array = np.asarray(ramp * (units.first + 0.5 + np.arange(units.size)) / (HOUR * rate), dtype=np.float64)
     after = dict(carry)
     for term, values in units.values.items():
         strength = np.sqrt(np.broadcast_to(level[term], units.size))

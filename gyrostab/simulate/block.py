@@ -1,0 +1,205 @@
+"""One stretch of a simulated log: from drivers and fresh random numbers through noise, effects and logger to rates."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.physics.base import STAGES, Chunk, Effect, Setup
+from gyrostab.simulate.drivers import Source, Stretch
+from gyrostab.simulate.noise import Units, shape
+from gyrostab.timegrid import grid_times
+
+__all__ = ["BlockState", "Plan", "Step", "check_effects", "next_block"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One effect in its place."""
+
+    effect: Effect
+    setup: Setup
+    rows: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything about a simulation that does not change with time.
+
+    Attributes
+    ----------
+    rate : float
+        Sampling rate of the log [Hz].
+    oversampling : int
+        Samples of the instrument in one of the log.
+    start : int
+        First stamp [ns since 1970].
+    axes : tuple of str
+    coefficients : tuple of mapping
+        Noise coefficients of each axis.
+    steps : tuple of Step
+        The effects, in the order in which they act.
+    sources : mapping of str to Source
+        Channels that are needed, by their names in the log.
+    turning : str
+        Axis that feels the channel ``rotation_rate``; empty when none does.
+    gaps : ndarray of int64, shape (n, 2)
+        Samples of the log that are missing, [first, one past last], rising.
+    """
+
+    rate: float
+    oversampling: int
+    start: int
+    axes: tuple[str, ...]
+    coefficients: tuple[Mapping[str, float], ...]
+    steps: tuple[Step, ...]
+    sources: Mapping[str, Source]
+    turning: str
+    gaps: NDArray[np.int64]
+
+
+@dataclass
+class BlockState:
+    """What one stretch hands to the next."""
+
+    effects: list[Any]
+    drivers: dict[str, float | None] = field(default_factory=dict)
+    noise: dict[str, Mapping[str, float]] = field(default_factory=dict)
+
+
+def next_block(
+    plan: Plan,
+    state: BlockState,
+    first: int,
+    count: int,
+    units: Sequence[Units],
+    parts: Mapping[str, tuple[Stretch, Any]],
+    missing: NDArray[np.bool_] | None,
+) -> tuple[Array, BlockState]:
+    """Make the samples ``first`` to ``first + count`` of a log.
+
+    Parameters
+    ----------
+    plan : Plan
+    state : BlockState
+        From the stretch before; it is left as it was.
+    first, count : int
+        Samples of the log.
+    units : sequence of Units
+        Random numbers of each axis.
+    parts : mapping
+        Stretches of the long channels, by name.
+    missing : ndarray of bool, shape (axes, count), optional
+        Samples to be left out, besides the gaps of the plan.
+
+    Returns
+    -------
+    rate : ndarray, shape (axes, count)
+        Rate [degree hour-1], NaN where it is missing.
+    state : BlockState
+    """
+    state = copy.deepcopy(state)
+    factor = plan.oversampling
+    index = first * factor + np.arange(count * factor)
+    instants = grid_times(plan.start, plan.rate * factor, index)
+    channels = {}
+    for name, source in plan.sources.items():
+        channels[name], state.drivers[name] = source.at(instants, parts.get(name), state.drivers.get(name))
+    true = {axis: np.zeros(index.size) for axis in plan.axes}
+    if plan.turning:
+        true[plan.turning] += channels["rotation_rate"] * 3600.0
+    by_stage: dict[str, list[int]] = {stage: [] for stage in STAGES}
+    for number, step in enumerate(plan.steps):
+        by_stage[step.effect.stage].append(number)
+
+    def act(number: int, fast: bool = True, **given: Any) -> tuple[Step, Any]:
+        step = plan.steps[number]
+        size, skip = (index.size, 1) if fast else (count, factor)
+        drivers = {role: channels[name][::skip] for role, name in step.effect.channel_names().items() if role in step.effect.needs()}
+        chunk = Chunk(setup=step.setup, first=first * (factor // skip), size=size, drivers=drivers, **given)
+        values, state.effects[number] = step.effect.generate(chunk, state.effects[number])
+        return step, values
+
+    for number in by_stage["motion"]:
+        step, values = act(number, true=true)
+        for row, part in zip(step.rows, np.broadcast_to(values, (len(step.rows), index.size)), strict=True):
+            true[plan.axes[row]] = true[plan.axes[row]] + part
+    signal = _noise(plan, state, by_stage["noise"], act, units, true)
+    for number in by_stage["rate"]:
+        step, values = act(number, true=true, signal=signal[list(plan.steps[number].rows)])
+        signal[list(step.rows)] += values
+    for stage in ("sensor", "electronics"):
+        for number in by_stage[stage]:
+            step, values = act(number, true=true, signal=signal[list(plan.steps[number].rows)])
+            signal[list(step.rows)] = values
+    slow = _sample(plan, by_stage["sampling"], act, signal, true, count)
+    true = {axis: values.reshape(count, factor).mean(axis=1) for axis, values in true.items()} if factor > 1 else true
+    for number in by_stage["logger"]:
+        step, values = act(number, fast=False, true=true, signal=slow[list(plan.steps[number].rows)])
+        slow[list(step.rows)] = values
+    _lose(plan, slow, first, missing)
+    return slow, state
+
+
+def _noise(plan: Plan, state: BlockState, numbers: list[int], act: Any, units: Sequence[Units], true: Mapping[str, Array]) -> Array:
+    """True rate and noise, with the noise at the level that the effects give it."""
+    size = units[0].size
+    levels = [
+        {term: np.full(size, value**2) if numbers else value**2 for term, value in coefficients.items()}
+        for coefficients in plan.coefficients
+    ]
+    for number in numbers:
+        rows = plan.steps[number].rows
+        before = {term: np.stack([levels[row][term] for row in rows]) for term in plan.steps[number].effect.terms}
+        step, changed = act(number, true=true, level=before)
+        for term, values in changed.items():
+            for row, one in zip(step.rows, np.broadcast_to(values, (len(rows), size)), strict=True):
+                levels[row][term] = np.maximum(one, 0.0)
+    signal = np.empty((len(plan.axes), size))
+    for row, axis in enumerate(plan.axes):
+        noise, state.noise[axis] = shape(
+            units[row], levels[row], plan.rate * plan.oversampling, state.noise.get(axis, {}), ramp=plan.coefficients[row]["R"]
+        )
+        signal[row] = noise + true[axis]
+    return signal
+
+
+def _sample(plan: Plan, numbers: list[int], act: Any, signal: Array, true: Mapping[str, Array], count: int) -> Array:
+    """The samples of the log: those that an effect picked, or means over the sampling interval."""
+    rows: list[Array] = list(signal)
+    for number in numbers:
+        before = [rows[row] for row in plan.steps[number].rows]
+        if any(row.size != count * plan.oversampling for row in before):
+            name = plan.steps[number].effect.name
+            raise OptionError(f"effect {name!r} comes after another that has picked the samples of the log already; leave one of them out")
+        step, values = act(number, true=true, signal=np.stack(before))
+        for row, one in zip(step.rows, values, strict=True):
+            rows[row] = one
+    return np.stack([row if row.size == count else row.reshape(count, plan.oversampling).mean(axis=1) for row in rows])
+
+
+def _lose(plan: Plan, rate: Array, first: int, missing: NDArray[np.bool_] | None) -> None:
+    """Put NaN into the gaps."""
+    count = rate.shape[1]
+    for begin, end in plan.gaps[np.searchsorted(plan.gaps[:, 1], first, side="right") : np.searchsorted(plan.gaps[:, 0], first + count)]:
+        rate[:, max(begin - first, 0) : end - first] = np.nan
+    if missing is not None:
+        rate[np.asarray(missing)] = np.nan
+
+
+def check_effects(steps: Sequence[Step]) -> list[Step]:
+    """Parameters with one number for each axis fit the axes of the log."""
+    for step in steps:
+        for item in step.effect.parameters():
+            if item.many and len(getattr(step.effect, item.name)) != len(step.rows):
+                axes = ", ".join(step.setup.axes)
+                raise OptionError(f"effect {step.effect.name!r}, parameter {item.name!r}: give one number for each of the axes {axes}")
+    return list(steps)

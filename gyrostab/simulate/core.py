@@ -1,0 +1,323 @@
+"""Model to log: the frame of time, the plan, and the lazy blocks."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.gaps import gap_variables
+from gyrostab.noise import TERMS
+from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
+from gyrostab.schema import GAP_CAUSES, SIGNAL_UNITS, attributes, check_log, log_channels, signal_name
+from gyrostab.simulate.block import BlockState, Plan, Step, check_effects, next_block
+from gyrostab.simulate.channels import combine, stamp
+from gyrostab.simulate.drivers import make_source
+from gyrostab.simulate.model import PROFILES, Model, read_model
+from gyrostab.simulate.noise import NoiseState, Units, begin_noise, draw, stream
+from gyrostab.timegrid import first_stamp, grid_index, grid_times, time_coordinate
+from gyrostab.windows import duration_seconds
+
+__all__ = ["simulate"]
+
+#: Samples of the instrument in one block of the lazy log.
+BLOCK = 2**18
+_RESTART = GAP_CAUSES.index("restart")
+
+
+def simulate(
+    model: str | os.PathLike[str] | Mapping[str, Any] | Model,
+    *,
+    duration: Any = None,
+    rate: float | None = None,
+    start: Any = None,
+    seed: int | None = None,
+    like: xr.Dataset | None = None,
+    environment: xr.Dataset | None = None,
+    chunk: int | None = None,
+) -> xr.Dataset:
+    """Simulate a gyro log.
+
+    Parameters
+    ----------
+    model : path, mapping or Model
+        Noise, effects, environment and frame of the log; see docs/simulate.md.
+    duration : str or float, optional
+        Length of the log ("200h"); a number is in seconds. Without it that of the model, or of `like`.
+    rate : float, optional
+        Sampling rate [Hz].
+    start : str, optional
+        Time of the first sample, ISO 8601, UTC.
+    seed : int, optional
+        The same seed gives the same bits, whatever the chunks; with and without effects it gives the same noise. 0 by default.
+    like : xarray.Dataset, optional
+        Regular log whose stamps, gaps and channels are taken; rate, start and axes are then its own.
+    environment : xarray.Dataset, optional
+        More channels and gaps, from the functions of `gyrostab.simulate.environment` and `gyrostab.simulate.losses`.
+    chunk : int, optional
+        Samples of a chunk of the lazy log.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``rate(axis, time)`` [degree hour-1], lazy, NaN at every missing sample; the channels; the table of gaps.
+        Chunks are made one after the other, so that a late one needs those before it.
+
+    Raises
+    ------
+    OptionError, FormatError
+        When the model or an option makes no sense.
+    SchemaError
+        When an effect lacks its channel, or `like` is no log.
+
+    Examples
+    --------
+    >>> log = simulate({"noise": {"N": 0.01}}, duration="1min", rate=100.0, seed=4)
+    >>> log.rate.shape, log.rate.units
+    ((3, 6000), 'degree hour-1')
+    >>> biased = {"noise": {"N": 0.01}, "effect": [{"name": "temperature_bias", "sensitivity": 0.1}],
+    ...           "environment": [{"profile": "steps", "channel": "temperature", "unit": "degC", "points": [[0, 35]]}]}
+    >>> difference = simulate(biased, duration="1min", rate=100.0, seed=4).rate - log.rate
+    >>> float(difference.min().round(6)), float(difference.max().round(6))
+    (1.0, 1.0)
+    """
+    made = model if isinstance(model, Model) else read_model(model)
+    frame = _frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
+    if chunk is not None and chunk < 1:
+        raise OptionError(f"chunk={chunk!r}: give at least 1 sample")
+    world = _world(made, frame, like, environment)
+    table = _gap_table(world, frame)
+    steps = _steps(made, frame, table)
+    plan = _plan(made, frame, world, table, steps)
+    data = _blocks(plan, frame, like, chunk or max(1, BLOCK // frame.oversampling), made.flicker_band)
+    return _labelled(made, frame, world, table, data)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Grid of time and axes of the log."""
+
+    rate: float
+    size: int
+    start: int
+    seed: int
+    axes: tuple[str, ...]
+    oversampling: int
+
+
+def _frame(model: Model, *, duration: Any, rate: float | None, start: Any, seed: int | None, like: xr.Dataset | None) -> _Frame:
+    chosen = int(model.log.get("seed", 0) if seed is None else seed)
+    if chosen < 0:
+        raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
+    factor = int(model.log.get("oversampling", 1))
+    if like is not None:
+        given = {"duration": duration, "rate": rate, "start": start}
+        extra = [name for name, value in given.items() if value is not None]
+        if extra:
+            raise OptionError(f"{extra[0]} is taken from the recording that the log shall be like; leave out {extra[0]} or like")
+        check_log(like)
+        axes = tuple(str(axis) for axis in like["axis"].values)
+        return _checked(model, _Frame(float(like.attrs["sampling_rate_hz"]), like.sizes["time"], first_stamp(like), chosen, axes, factor))
+    hertz = model.log.get("rate") if rate is None else rate
+    length = model.log.get("duration") if duration is None else duration
+    for name, value, example in (("rate", hertz, "100 (Hz)"), ("duration", length, "1h")):
+        if value is None:
+            raise OptionError(f"{model.source}: there is no {name}; give {name} = {example} in [log], --{name}, or --like RECORDING")
+    if isinstance(hertz, bool) or not isinstance(hertz, int | float) or not (math.isfinite(hertz) and 0 < hertz <= 1e6):
+        raise OptionError(f"{model.source}: rate {hertz!r} is not a number of Hz above 0 and up to 1e6")
+    size = round(duration_seconds(length, "duration") * hertz)
+    if size < 1:
+        raise OptionError(f"{model.source}: a duration of {length} is shorter than one sample at {hertz:g} Hz")
+    begin = stamp(start if start is not None else model.log.get("start", "1970-01-01"))
+    return _checked(model, _Frame(float(hertz), size, begin, chosen, model.axes or ("x", "y", "z"), factor))
+
+
+def _checked(model: Model, frame: _Frame) -> _Frame:
+    named = [axis for axis in model.noise if axis] + [axis for effect in model.effects for axis in effect.axes]
+    for axis in named:
+        if axis not in frame.axes:
+            raise OptionError(f"{model.source}: there is no axis {axis!r} in this log; it has {', '.join(frame.axes)}")
+    return frame
+
+
+def _world(model: Model, frame: _Frame, like: xr.Dataset | None, environment: xr.Dataset | None) -> xr.Dataset:
+    """Channels and gaps from all that there are."""
+    parts = []
+    if like is not None:
+        kept = {*log_channels(like), *(name for name, variable in like.variables.items() if variable.dims == ("gap",))}
+        parts.append(like[[name for name in like.variables if name in kept]].drop_vars("axis", errors="ignore"))
+    for name, values in model.environment:
+        function = PROFILES[name][0]
+        given = {"duration": frame.size / frame.rate, "start": frame.start, **values}
+        if "seed" in inspect.signature(function).parameters:
+            given.setdefault("seed", frame.seed)
+        parts.append(function(**given))
+    if environment is not None:
+        parts.append(environment)
+    return combine(*parts).drop_attrs(deep=False) if parts else xr.Dataset()
+
+
+def _gap_table(world: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
+    """Gaps in samples: first missing, first present after, samples missing, rows concerned, cause; those that overlap are one."""
+    if "gap_start" not in world:
+        return np.empty((0, 5), np.int64)
+    first, end = (
+        np.ceil(grid_index(frame.start, frame.rate, world[name].values.astype("datetime64[ns]").astype(np.int64)) - 1e-3)
+        for name in ("gap_start", "gap_end")
+    )
+    first, end = (np.clip(edge, 0, frame.size).astype(np.int64) for edge in (first, end))
+    rows: list[list[int]] = []
+    for begin, until, cause in sorted(zip(first.tolist(), end.tolist(), world["gap_cause"].values.tolist(), strict=True)):
+        if until <= begin:
+            continue
+        if rows and begin < rows[-1][1]:
+            rows[-1][1] = max(rows[-1][1], until)
+            rows[-1][4] = _RESTART if _RESTART in (rows[-1][4], cause) else rows[-1][4]
+        else:
+            rows.append([begin, until, 0, 0, int(cause)])
+    table = np.array(rows, dtype=np.int64).reshape(-1, 5)
+    table[:, 2] = table[:, 1] - table[:, 0]
+    return table
+
+
+def _steps(model: Model, frame: _Frame, table: NDArray[np.int64]) -> list[Step]:
+    """The effects in the order in which they act."""
+    steps = []
+    for effect in sorted(model.effects, key=lambda effect: STAGES.index(effect.stage)):  # keeps the model's order within a stage
+        rows = tuple(row for row, axis in enumerate(frame.axes) if not effect.axes or axis in effect.axes)
+        factor = 1 if effect.stage == "logger" else frame.oversampling
+        noise = [model.coefficients(frame.axes[row]) for row in rows]
+        setup = Setup(
+            rate=frame.rate * factor,
+            size=frame.size * factor,
+            start=frame.start,
+            axes=tuple(frame.axes[row] for row in rows),
+            noise={term: np.array([one[term] for one in noise]) for term in TERMS},
+            gaps=table[:, :2] * factor,
+            restarts=table[table[:, 4] == _RESTART, :2] * factor,
+            oversampling=frame.oversampling,
+        )
+        steps.append(Step(effect, setup, rows))
+    return check_effects(steps)
+
+
+def _plan(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], steps: list[Step]) -> Plan:
+    present = log_channels(world)
+    needed: dict[str, Effect | None] = {}
+    for step in steps:
+        names = step.effect.channel_names()
+        for role in step.effect.needs():
+            if names[role] not in present:
+                raise driver_error(step.effect, role, present)
+            units = world[names[role]].attrs.get("units")
+            if units != step.effect.channels[role]:
+                raise SchemaError(
+                    f"effect {step.effect.name!r} needs {names[role]!r} in {step.effect.channels[role]}; the channel is in {units!r}"
+                )
+            needed[names[role]] = step.effect
+    turning = str(world["rotation_rate"].attrs.get("rotation_axis", "")) if "rotation_rate" in present else ""
+    if turning and turning not in frame.axes:
+        raise OptionError(
+            f"{model.source}: the tool turns about the axis {turning!r}, which the log has not; it has {', '.join(frame.axes)}"
+        )
+    if turning:
+        needed["rotation_rate"] = None
+    return Plan(
+        rate=frame.rate,
+        oversampling=frame.oversampling,
+        start=frame.start,
+        axes=frame.axes,
+        coefficients=tuple(model.coefficients(axis) for axis in frame.axes),
+        steps=tuple(steps),
+        sources={name: make_source(world, name) for name in needed},
+        turning=turning,
+        gaps=table[:, :2],
+    )
+
+
+def _terms(plan: Plan, row: int) -> str:
+    """Noise terms of an axis that some stretch may hold."""
+    changed = "".join(step.effect.terms for step in plan.steps if step.effect.stage == "noise" and row in step.rows)
+    return "".join(term for term in "QNBK" if plan.coefficients[row][term] > 0.0 or term in changed)
+
+
+def _draw(previous: tuple[Any, NoiseState], first: int, size: int, gate: Any) -> tuple[Units, NoiseState]:
+    """The random numbers of the next block of an axis; `gate` only holds them back, so that they do not run far ahead."""
+    return draw(previous[1], first, size)
+
+
+def _begin(plan: Plan, seed: int) -> BlockState:
+    counts: dict[str, int] = {}
+    states = []
+    for step in plan.steps:
+        name = step.effect.name
+        counts[name] = counts.get(name, 0) + 1
+        states.append(step.effect.begin(step.setup, stream(seed, "effect", name, counts[name])))
+    return BlockState(states)
+
+
+def _blocks(plan: Plan, frame: _Frame, like: xr.Dataset | None, chunk: int, band: tuple[float, float]) -> Any:
+    """The rates as a dask array: chains of blocks, each of which hands its state to the next."""
+    import dask
+    import dask.array as da
+
+    factor = frame.oversampling
+    small = {name: source if source.stamps is not None else replace(source, values=None) for name, source in plan.sources.items()}
+    fixed = dask.delayed(replace(plan, sources=small), traverse=False)
+    more, step = dask.delayed(_draw, pure=False), dask.delayed(next_block, pure=False, nout=2)
+    starts = (
+        begin_noise(frame.seed, axis, rate=frame.rate * factor, terms=_terms(plan, row), flicker_band=band)
+        for row, axis in enumerate(frame.axes)
+    )
+    draws = [dask.delayed((None, state), traverse=False) for state in starts]
+    states: list[Any] = [dask.delayed(_begin(plan, frame.seed), traverse=False)]
+    signal = None if like is None else like[signal_name(like)].transpose("axis", "time").data
+    blocks = []
+    for first in range(0, frame.size, chunk):
+        count = min(chunk, frame.size - first)
+        draws = [more(one, first * factor, count * factor, states[max(0, len(states) - 3)]) for one in draws]
+        before, end = grid_times(frame.start, frame.rate * factor, np.array([max(first * factor - 1, 0), (first + count) * factor - 1]))
+        parts = {}
+        for name, source in plan.sources.items():
+            stretch = source.stretch(int(before), int(end))
+            if stretch is not None:
+                parts[name] = (stretch, source.values[stretch.low : stretch.high])
+        missing = None if signal is None else np.isnan(signal[:, first : first + count])
+        values, state = step(fixed, states[-1], first, count, [one[0] for one in draws], parts, missing)
+        states.append(state)
+        blocks.append(da.from_delayed(values, (len(frame.axes), count), dtype=np.float64))
+    return da.concatenate(blocks, axis=1)
+
+
+def _labelled(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], data: Any) -> xr.Dataset:
+    gaps = [name for name, variable in world.variables.items() if variable.dims == ("gap",)]
+    log = world.drop_vars(gaps).assign(
+        {
+            "rate": (("axis", "time"), data, {"units": SIGNAL_UNITS["rate"], "long_name": "rotation rate"}),
+            **gap_variables(table, frame.start, frame.rate),
+        }
+    )
+    log = log.assign_coords(axis=("axis", list(frame.axes), attributes("axis")))
+    if "time" not in log.coords:
+        log = log.assign_coords(time_coordinate(frame.start, frame.rate, frame.size))
+    now = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
+    log.attrs = {
+        "sampling_rate_hz": frame.rate,
+        "kind": "rate",
+        "source_files": [model.source],
+        "history": f"{now} gyrostab.simulate: {frame.size} samples at {frame.rate:.10g} Hz, seed {frame.seed}",
+        "notes": [],
+        "simulation_model": model.text,
+        "simulation_seed": frame.seed,
+    }
+    check_log(log)
+    return log

@@ -1,0 +1,153 @@
+"""Channels of a log at the samples where effects need them: interpolated, without holes, for any stretch of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import SchemaError
+from gyrostab.timegrid import TimeGridIndex, grid_index
+
+__all__ = ["Source", "Stretch", "make_source"]
+
+Array = NDArray[np.float64]
+#: Longer channels are read stretch by stretch.
+SHORT = 2**22
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """The part of a long channel that some instants need."""
+
+    low: int
+    high: int
+
+
+@dataclass(frozen=True)
+class Source:
+    """A channel that can be asked for its value at any instant.
+
+    Attributes
+    ----------
+    name : str
+        Name in the log.
+    units : str
+        Its unit.
+    held : bool
+        Values hold until the next one; otherwise they run straight towards it.
+    stamps : ndarray of int64, or None
+        Instants of the values [ns since 1970]; None for a long channel.
+    values : ndarray or dask array
+        The values; a long channel may have NaN.
+    start, rate
+        Grid of a long channel: first stamp [ns since 1970], samples in a second [Hz].
+    first : float
+        First value that is a number.
+    """
+
+    name: str
+    units: str
+    held: bool
+    stamps: NDArray[np.int64] | None
+    values: Any
+    start: int = 0
+    rate: float = 1.0
+    first: float = np.nan
+
+    def stretch(self, before: int, end: int) -> Stretch | None:
+        """Which values the instants after `before` up to `end` [ns] need; None for a channel that is in memory."""
+        if self.stamps is not None:
+            return None
+        first, last = np.floor(grid_index(self.start, self.rate, [before, end])).astype(int).tolist()
+        size = self.values.size
+        return Stretch(min(max(first, 0), size - 1), min(max(last + 2, 1), size))
+
+    def at(self, instants: NDArray[np.int64], part: tuple[Stretch, Any] | None, carry: float | None) -> tuple[Array, float | None]:
+        """Values at rising `instants` [ns since 1970].
+
+        Parameters
+        ----------
+        instants : ndarray of int64
+            Where.
+        part : (Stretch, ndarray), optional
+            The values of a long channel that `stretch` asked for.
+        carry : float, optional
+            What the call for the instants just before gave back.
+
+        Returns
+        -------
+        values : ndarray
+        carry : float or None
+        """
+        if self.stamps is not None:
+            return self._between(instants), None
+        assert part is not None
+        stretch, values = part
+        known = np.asarray(values, dtype=np.float64)
+        whole = _filled(np.concatenate([[self.first if carry is None else carry], known]))
+        position = np.clip(grid_index(self.start, self.rate, instants) - stretch.low + 1, 0 if stretch.low else 1, known.size)
+        position = np.where(np.abs(position - np.rint(position)) < 1e-6, np.rint(position), position)
+        base = np.floor(position).astype(np.int64)
+        after = whole[base] if self.held else np.interp(position, np.arange(whole.size), whole)
+        return after, float(whole[base[-1]])
+
+    def _between(self, instants: NDArray[np.int64]) -> Array:
+        stamps = self.stamps
+        assert stamps is not None
+        if self.held:
+            return np.asarray(self.values[np.maximum(np.searchsorted(stamps, instants, side="right") - 1, 0)])
+        low = max(0, int(np.searchsorted(stamps, instants[0], side="right")) - 1)
+        high = int(np.searchsorted(stamps, instants[-1], side="left")) + 1
+        origin = stamps[low]
+        at, known = (instants - origin).astype(np.float64), (stamps[low:high] - origin).astype(np.float64)
+        return np.asarray(np.interp(at, known, self.values[low:high]))
+
+
+def _filled(values: Array) -> Array:
+    """Each NaN replaced by the number before it."""
+    good = ~np.isnan(values)
+    return np.asarray(values[np.maximum.accumulate(np.where(good, np.arange(values.size), 0))])
+
+
+def _first_number(values: Any, name: str) -> float:
+    for low in range(0, values.size, SHORT):
+        part = np.asarray(values[low : low + SHORT], dtype=np.float64)
+        good = part[~np.isnan(part)]
+        if good.size:
+            return float(good[0])
+    raise SchemaError(f"the channel {name!r} holds no number; leave it out, or name another with driver = ...")
+
+
+def make_source(log: xr.Dataset, name: str) -> Source:
+    """A channel of a log, ready to be asked.
+
+    Raises
+    ------
+    SchemaError
+        When it holds no number.
+
+    Examples
+    --------
+    >>> from gyrostab.simulate.environment import ramps
+    >>> warm = make_source(ramps("temperature", "degC", [[0, 20], [4, 60]], duration=5.0), "temperature")
+    >>> warm.at(np.array([500_000_000, 1_500_000_000]), None, None)[0]
+    array([25., 35.])
+    """
+    variable = log[name]
+    dim = str(variable.dims[0])
+    data = variable.data
+    units = str(variable.attrs.get("units", ""))
+    held = variable.attrs.get("interpolation") == "previous"
+    index = log.xindexes.get(dim)
+    if data.size > SHORT and isinstance(index, TimeGridIndex):
+        return Source(name, units, held, None, data, start=index.start, rate=index.rate, first=_first_number(data, name))
+    values = np.asarray(data, dtype=np.float64)
+    good = ~np.isnan(values)
+    if not good.any():
+        _first_number(values, name)
+    stamps = log[dim].values.astype("datetime64[ns]").astype(np.int64)[good]
+    return Source(name, units, held, stamps, values[good])

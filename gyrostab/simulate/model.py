@@ -1,0 +1,208 @@
+"""A model: noise, effects, environment and the frame of the log, from TOML or a dict. See docs/simulate.md."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import os
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gyrostab.errors import FormatError, OptionError
+from gyrostab.noise import LAWS, TERMS
+from gyrostab.physics.base import Effect
+from gyrostab.physics.registry import amount, close_to, make_effect
+from gyrostab.simulate import environment, losses
+from gyrostab.simulate.noise import FLICKER_LOW
+
+__all__ = ["PROFILES", "Model", "read_model"]
+
+#: Function of the environment -> (the function, unit of each number).
+PROFILES: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
+    "steps": (environment.steps, {"sensor_rate": "Hz"}),
+    "ramps": (environment.ramps, {"sensor_rate": "Hz"}),
+    "vibration": (environment.vibration, {"band": "Hz", "sensor_rate": "Hz"}),
+    "chamber": (
+        environment.chamber,
+        {"low": "degC", "high": "degC", "speed": "degC/min", "hold": "s", "lag": "s", "sensor_rate": "Hz"},
+    ),
+    "trip": (
+        environment.trip,
+        {"surface": "degC", "gradient": "degC/km", "cooling": "1", "response": "s", "sensor_rate": "Hz"},
+    ),
+    "rotation": (
+        environment.rotation,
+        {"stick_slip": "1", "period": "s", "inclination": "deg", "toolface": "deg", "sensor_rate": "Hz"},
+    ),
+    "supply": (environment.supply, {"full": "V", "empty": "V", "life": "s", "sensor_rate": "Hz"}),
+    "light_power": (environment.light_power, {"power": "W", "loss": "dB", "sensor_rate": "Hz"}),
+    "gaps": (losses.gaps, {}),
+    "losses": (losses.losses, {"per_hour": "1", "mean": "s", "bursts_per_hour": "1", "burst": "s", "within": "1"}),
+    "power_cuts": (losses.power_cuts, {"per_day": "1", "mean": "s"}),
+}
+_GIVEN = ("duration", "start", "seed")  # by the log, not by the table of a profile
+_LOG = ("rate", "duration", "start", "seed", "axes", "oversampling")
+
+
+@dataclass(frozen=True)
+class Model:
+    """What `gyrostab.simulate` makes a log from.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        Axes that the model names; empty when it names none.
+    noise : mapping of str to (mapping of str to float)
+        Axis (or "" for all others) -> symbol -> coefficient [unit of the noise table].
+    flicker_band : (float, float)
+        Lowest and highest frequency of B [Hz].
+    effects : tuple of Effect
+    environment : tuple of (str, mapping)
+        Function of `PROFILES` and its arguments.
+    log : mapping
+        Of rate [Hz], duration [s], start, seed, oversampling what the model gives.
+    source : str
+        Where the model came from.
+    text : str
+        The model as it was written.
+    """
+
+    axes: tuple[str, ...] = ()
+    noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf)
+    effects: tuple[Effect, ...] = ()
+    environment: tuple[tuple[str, Mapping[str, Any]], ...] = ()
+    log: Mapping[str, Any] = field(default_factory=dict)
+    source: str = "model"
+    text: str = ""
+
+    def coefficients(self, axis: str) -> dict[str, float]:
+        """Noise coefficients of an axis, all five."""
+        return {**dict.fromkeys(TERMS, 0.0), **self.noise.get("", {}), **self.noise.get(axis, {})}
+
+
+def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
+    """Read a model from a TOML file or from the same tables as a dict.
+
+    Raises
+    ------
+    FormatError
+        When the file is not TOML or cannot be read.
+    OptionError
+        When a name, a parameter or a unit is unknown or missing; the message names it and lists what exists.
+
+    Examples
+    --------
+    >>> read_model({"noise": {"N": 0.003, "z": {"N": "0.005 deg/sqrt(h)"}}}).coefficients("z")["N"]
+    0.005
+    """
+    if isinstance(model, Mapping):
+        where, tables, text = "model", dict(model), json.dumps(model, default=str)
+    else:
+        where, path = str(model), Path(model)
+        try:
+            text = path.read_text(encoding="utf-8")
+            tables = tomllib.loads(text)
+        except OSError as error:
+            raise FormatError(f"{path}: cannot be read ({error.strerror})") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise FormatError(f"{path}: not a TOML file ({error})") from error
+    known = ("log", "noise", "effect", "environment")
+    for key, table in tables.items():
+        if key not in known:
+            raise OptionError(
+                f"{where}: there is no section {key!r}{close_to(key, known)}; there are [log], [noise], [[effect]], [[environment]]"
+            )
+        if not isinstance(table, list if key in ("effect", "environment") else Mapping):
+            raise OptionError(f"{where}: write {key} as {'[[' + key + ']]' if key in ('effect', 'environment') else '[' + key + ']'}")
+    noise, band = _noise(tables.get("noise", {}), where)
+    effects = [make_effect(table, where=f"{where}, effect {number}") for number, table in enumerate(tables.get("effect", []), start=1)]
+    profiles = [_profile(table, f"{where}, environment {number}") for number, table in enumerate(tables.get("environment", []), start=1)]
+    log = _log(tables.get("log", {}), where)
+    axes = tuple(log.pop("axes", ())) or _axes(noise, effects)
+    found = Model(axes, noise, band, tuple(effects), tuple(profiles), log, source=where, text=text)
+    _check_axes(found)
+    return found
+
+
+def _noise(table: Mapping[str, Any], where: str) -> tuple[dict[str, dict[str, float]], tuple[float, float]]:
+    noise: dict[str, dict[str, float]] = {}
+    band = (FLICKER_LOW, math.inf)
+    for key, value in table.items():
+        if key == "flicker_band":
+            edges = amount(value, "Hz", f"{where}: flicker_band")
+            if not (isinstance(edges, list) and len(edges) == 2 and all(isinstance(edge, int | float) for edge in edges)):
+                raise OptionError(f"{where}: flicker_band is {value!r}; write [lowest, highest] frequency in Hz")
+            band = (float(edges[0]), float(edges[1]))
+        elif isinstance(value, Mapping):
+            noise[key] = {term: _coefficient(term, number, f"{where}, [noise.{key}]") for term, number in value.items()}
+        else:
+            noise.setdefault("", {})[key] = _coefficient(key, value, f"{where}, [noise]")
+    return noise, band
+
+
+def _coefficient(term: str, value: Any, where: str) -> float:
+    if term not in LAWS:
+        listed = ", ".join(f"{symbol} [{law.label}]" for symbol, law in LAWS.items())
+        raise OptionError(f"{where}: there is no noise term {term!r}; there are {listed}, and flicker_band in [noise]")
+    number = amount(value, LAWS[term].label, f"{where}: {term}")
+    if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number) or (number < 0 and term != "R"):
+        raise OptionError(f"{where}: {term} = {value!r} is not a number from 0 up; give one in {LAWS[term].label}")
+    return float(number)
+
+
+def _log(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        if key not in _LOG:
+            raise OptionError(f"{where}, [log]: there is no {key!r}{close_to(key, _LOG)}; there are {', '.join(_LOG)}")
+        found[key] = amount(value, {"rate": "Hz", "duration": "s"}[key], f"{where}: {key}") if key in ("rate", "duration") else value
+    for key in ("seed", "oversampling"):
+        if key in found and (not isinstance(found[key], int) or isinstance(found[key], bool) or found[key] < (key == "oversampling")):
+            raise OptionError(f"{where}, [log]: {key} = {found[key]!r} is not a whole number {'above 0' if key != 'seed' else 'from 0 up'}")
+    if "start" in found:
+        found["start"] = str(found["start"])
+    return found
+
+
+def _axes(noise: Mapping[str, Any], effects: list[Effect]) -> tuple[str, ...]:
+    if "" in noise or not noise:
+        return ()
+    named = [axis for axis in noise if axis] + [axis for effect in effects for axis in effect.axes]
+    return tuple(dict.fromkeys(named))
+
+
+def _check_axes(model: Model) -> None:
+    if not model.axes:
+        return
+    for effect in model.effects:
+        strange = [axis for axis in effect.axes if axis not in model.axes]
+        if strange:
+            raise OptionError(f"{model.source}: effect {effect.name!r}: the log has no axis {strange[0]!r}; it has {', '.join(model.axes)}")
+
+
+def _profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[str, Any]]:
+    name = table.get("profile")
+    if name not in PROFILES:
+        what = "an environment has no profile" if name is None else f"there is no profile {name!r}{close_to(name, list(PROFILES))}"
+        raise OptionError(f"{where}: {what}; there are {', '.join(PROFILES)}")
+    function, units = PROFILES[str(name)]
+    arguments = {key: item for key, item in inspect.signature(function).parameters.items() if key not in _GIVEN or (key == "seed")}
+    values = {key: value for key, value in table.items() if key != "profile"}
+    for key in values:
+        if key not in arguments:
+            listed = ", ".join(f"{item} [{units[item]}]" if item in units else item for item in arguments)
+            raise OptionError(f"{where}: profile {name!r} has no parameter {key!r}{close_to(key, list(arguments))}; it has {listed}")
+    for key, item in arguments.items():
+        if item.default is inspect.Parameter.empty and key not in values:
+            raise OptionError(f"{where}: profile {name!r} lacks {key!r}; see gyrostab.simulate.environment.{name} for what it holds")
+    converted = {key: amount(value, units[key], f"{where}: {key}") if key in units else value for key, value in values.items()}
+    for key, unit in units.items():
+        number = converted.get(key, 0.0)
+        if key != "band" and (isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number)):
+            raise OptionError(f"{where}: {key} = {number!r} is not a number; give one in {unit}")
+    return str(name), converted
