@@ -80,16 +80,15 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
 
 
 def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
-    """The file as a regular log of gyrostab, or None when it is something else."""
+    """The file as a regular log, of gyrostab or with a stamp for each sample, or None when it is something else."""
+    if _is_own(path):
+        return _open_own(path, options)
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     extra: Any = {"consolidated": False} if path.is_dir() else {}
     try:
         stored = xr.open_dataset(path, engine=engine, chunks={}, decode_times=False, **extra)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
-    if stored.attrs.get("gyrostab_content") == "log":
-        stored.close()
-        return _open_own(path, options)
     has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
     if not (has_signal and "sampling_rate_hz" in stored.attrs and {"axis", "time"} <= set(stored.variables)):
         stored.close()
@@ -112,6 +111,19 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     log.attrs = {name: value.item() if isinstance(value, np.generic) else value for name, value in log.attrs.items()}
     log.attrs.setdefault("source_files", [path.name])
     return _rebuild_time(path, log)
+
+
+def _is_own(path: Path) -> bool:
+    """Whether it says that gyrostab wrote it as a log; what is damaged as a whole says nothing."""
+    import netCDF4
+
+    try:
+        if path.is_dir():
+            return bool(json.loads((path / ".zattrs").read_text()).get("gyrostab_content") == "log")
+        with netCDF4.Dataset(path) as file:
+            return bool(getattr(file, "gyrostab_content", "") == "log")
+    except (OSError, RuntimeError, ValueError, AttributeError):
+        return False
 
 
 def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:

@@ -25,6 +25,9 @@ from gyrostab.timegrid import grid_times
 
 __all__ = ["open_stored"]
 
+#: Values from which a variable of a log is a dask array.
+_SMALL = 2**17
+
 
 def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     """Open what gyrostab wrote, as it lies on disk: times not decoded, data lazy, chunks of a log checked as they are read.
@@ -46,13 +49,26 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
-        stored = xr.open_dataset(path, engine=engine, chunks={}, decode_times=False, create_default_indexes=False)
+        stored = xr.open_dataset(path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False)
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise FormatError(f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again") from error
     if "gyrostab_version" not in stored.attrs:
         stored.close()
         raise FormatError(f"{path}: is {name}, but not one that gyrostab wrote; read it with gyrostab.read_log (gyrostab ingest)")
-    return _lazy_log(stored, path, strict=strict) if stored.attrs.get("gyrostab_content") == "log" else stored
+    is_log = stored.attrs.get("gyrostab_content") == "log"
+    return _lazy(_lazy_log(stored, path, strict=strict) if is_log else stored, small=_SMALL if is_log else 0)
+
+
+def _lazy(stored: xr.Dataset, *, small: int) -> xr.Dataset:
+    """Load what is small, and make dask arrays, by the chunks on disk, of what is not one yet: making and reading one takes its time."""
+    close = stored._close
+    rest = {name: item.variable for name, item in stored.data_vars.items() if item.chunks is None}
+    ready = {
+        name: item.load() if item.size < small else item.chunk(item.encoding.get("preferred_chunks", {})) for name, item in rest.items()
+    }
+    lazy = stored.assign(ready)
+    lazy.set_close(close)
+    return lazy
 
 
 def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
