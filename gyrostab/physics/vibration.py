@@ -1,4 +1,4 @@
-"""Effects of acceleration and vibration."""
+"""Effects of acceleration, vibration and the magnetic field."""
 
 from __future__ import annotations
 
@@ -8,14 +8,40 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Stage, Windows, parameter
+from gyrostab.errors import OptionError
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
 from gyrostab.units import INNER
 
-__all__ = ["GSensitivity"]
+__all__ = ["AliasedVibration", "GSensitivity", "Magnetic", "VibrationRectification"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class GSensitivity(Effect):
+class _Vector(Effect):
+    """Bias that is the scalar product of a vector channel, named ``..._x``, ``..._y``, ``..._z``, with the parameters x, y, z."""
+
+    def needs(self) -> tuple[str, ...]:
+        """Only the components that it is sensitive to."""
+        return tuple(channel for channel in self.channels if getattr(self, channel[-1]))
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        bias = np.zeros(chunk.size)
+        for channel in self.needs():
+            bias += getattr(self, channel[-1]) * chunk.drivers[channel]
+        return bias, state
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means: the components that there are."""
+        return Prediction(mean={name[-1]: windows.drivers[name] for name in self.channels if name in windows.drivers})
+
+    def parts(self, errors: Mapping[str, float] | None) -> str:
+        """``"0.01 deg/h/g along x"``, for sentences."""
+        named = [f"{self.quantity(name, errors)} along {name}" for name in self.size_parameters if getattr(self, name)]
+        return ", ".join(named) or "nothing"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GSensitivity(_Vector):
     """Bias that follows the acceleration.
 
     ``b = G_x a_x + G_y a_y + G_z a_z`` for each axis that it acts on.
@@ -49,22 +75,183 @@ class GSensitivity(Effect):
     y: float = parameter("deg/h/g", "bias per g along y", default=0.0, typical=1e-3, low=-10.0, high=10.0)
     z: float = parameter("deg/h/g", "bias per g along z", default=0.0, typical=1e-3, low=-10.0, high=10.0)
 
-    def needs(self) -> tuple[str, ...]:
-        """Only the accelerations that it is sensitive to."""
-        return tuple(f"accel_{name}" for name in self.size_parameters if getattr(self, name))
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        return f"The bias follows the acceleration {self.on_axes()}, by {self.parts(errors)}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class VibrationRectification(Effect):
+    """Bias that follows the square of the vibration.
+
+    ``b = k2 g^2 + k4 g^4``, g the rms acceleration
+
+    *DAVAR*: a step D where vibration starts or stops, and so ``D^2 tau / (3 (W - 2 tau))`` in the windows W across it: an apparent
+    ``K = D / sqrt(W)`` that is gone in windows wholly inside. *Window mean*: steps up with the vibration and back with it.
+    *Spectrum*: nothing but that of ``g^2``. *Axes*: each has its own factor; the sign does not depend on the direction of the vibration.
+
+    Confused with g_sensitivity (odd in g; one event cannot tell g from g^2, two levels of vibration can), bias_jump (does not go back when
+    vibration ends), vibration_random_walk (grows inside the windows, too) and real_motion (seen by accelerometers and by the other axes).
+
+    References
+    ----------
+    Qin et al. 2026 (0.0118 to 0.0445 deg/h under a sine of 6 g at 30 Hz, which is 0.7e-3 to 2.5e-3 deg/h/g^2); Cordova 1998, US patent
+    5847829 (windings that bring it down). Scaled to the 13.39 g of Wang et al. 2016: 0.1 to 0.4 deg/h.
+
+    Examples
+    --------
+    >>> VibrationRectification(sensitivity=1.5e-3, axes=["x"]).say()
+    'Vibration is rectified to a bias on axis x, of 0.0015 deg/h/g^2 times the square of the rms vibration.'
+    """
+
+    name: ClassVar[str] = "vibration_rectification"
+    short: ClassVar[str] = "bias follows g_rms squared"
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
+    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quartic")
+    references: ClassVar[tuple[str, ...]] = ("Qin et al. 2026", "Cordova 1998, US patent 5847829", "Wang et al. 2016, Sensors")
+
+    sensitivity: float = parameter("deg/h/g^2", "bias per mean square", typical=1.5e-3, low=-10.0, high=10.0, source="Qin et al. 2026")
+    quartic: float = parameter("deg/h/g^4", "bias per mean square squared", default=0.0, typical=1e-7, low=-1.0, high=1.0)
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
-        bias = np.zeros(chunk.size)
-        for channel in self.needs():
-            bias += getattr(self, channel[-1]) * chunk.drivers[channel]
-        return bias, state
+        square = chunk.drivers["vibration"] ** 2
+        return square * (self.sensitivity + square * self.quartic), state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: the accelerations that there are."""
-        return Prediction(mean={name: windows.drivers[f"accel_{name}"] for name in "xyz" if f"accel_{name}" in windows.drivers})
+        """Window means: the mean square of the vibration, and its square."""
+        square = windows.drivers["vibration"] ** 2
+        return Prediction(mean={"sensitivity": square, "quartic": square**2})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        parts = [f"{self.quantity(name, errors)} along {name}" for name in self.size_parameters if getattr(self, name)]
-        return f"The bias follows the acceleration {self.on_axes()}, by {', '.join(parts) or 'nothing'}."
+        more = f", and of {self.quantity('quartic', errors)} times its fourth power" if self.quartic else ""
+        size = self.quantity("sensitivity", errors)
+        return f"Vibration is rectified to a bias {self.on_axes()}, of {size} times the square of the rms vibration{more}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class AliasedVibration(Effect):
+    """Angular vibration in a band, as the samples see it: what lies above half of the sampling rate folds down.
+
+    ``rate(t) = s g(t) v(t)``: v is noise of unit power between `low` and `high` (Butterworth, half power at both), behind a mount of
+    stated resonance, if any; g is the rms of the vibration. A sample is v at its beginning (``"point"``) or the mean of v over its
+    interval (``"average"``, integrate and dump). So the samples have the density ``sum_k S(f + k fs) |H(f + k fs)|^2`` with H = 1 or sinc(f / fs),
+    because they are drawn from the process in continuous time, not because it is put in. Where the model makes the instrument sample faster than the
+    log, this is about the instrument, and the logger's own filter decides the rest.
+
+    *DAVAR*: point samples raise sigma at all averaging times, like N, where the band folds onto zero frequency (P16's 700 to 800 Hz
+    at 400 Hz fills 0 to 100 Hz: 8 times at 2.5 ms, 19 times from 40 ms on with 50 deg/h and N = 0.003); integrate and dump has its
+    zeros there and raises short times only, like Q (1.3, 1.4, 1.1 times at 2.5, 10, 40 ms). *Window mean*: nothing, and no bias.
+    *Spectrum*: the folded band. *Axes*: one rigid motion, with a factor for each axis.
+
+    Confused with vibration_noise (flat, no cross-spectrum), with Q (not tied to vibration) and spikes (heavy tails). What separates them is the
+    edge of the folded band, coherence of the axes, and another sampling rate, at which the band folds elsewhere.
+
+    References
+    ----------
+    Wang et al. 2016, Sensors (13.39 g, 1 g^2/Hz at 700 to 800 Hz, logged at 400 Hz); Optik, linear vibration and three-axis FOGs
+    in MWD (angular vibration by the mounting, under-sampled). The angular rate per g is an estimate.
+
+    Examples
+    --------
+    >>> AliasedVibration(sensitivity=4.0, low=700, high=800).say()
+    'Vibration at 700 to 800 Hz folds into the samples on all axes, with 4 deg/h/g; each sample is a point of it.'
+    """
+
+    name: ClassVar[str] = "aliased_vibration"
+    short: ClassVar[str] = "vibration above Nyquist folded down"
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
+    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
+    references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors", "Optik, linear vibration and three-axis FOGs in MWD")
+
+    sensitivity: tuple[float, ...] = parameter("deg/h/g", "rms rate in the band per rms g", typical=3.7, low=-1e6, high=1e6, many=True)
+    low: float = parameter("Hz", "lower edge of the band", default=700.0, low=0.01, high=1e5, source="Wang et al. 2016")
+    high: float = parameter("Hz", "upper edge of the band", default=800.0, low=0.01, high=1e5, source="Wang et al. 2016")
+    resonance: float = parameter("Hz", "resonance of the mount; 0 for a rigid one", default=0.0, low=0.0, high=1e5)
+    quality: float = parameter("1", "quality of that resonance", default=10.0, low=0.5, high=1000.0)
+    sampling: str = parameter("text", "how a sample is taken", default="point", choices=("point", "average"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.low < self.high:
+            raise OptionError(f"effect {self.name!r}: the band from low = {self.low:g} to high = {self.high:g} Hz is empty; low must be below high")
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """The process at rest in its stationary state."""
+        from gyrostab.kernels.coloured import band, rest
+
+        average = self.sampling == "average"
+        reading = band(self.low, self.high, setup.rate, resonance=self.resonance, quality=self.quality, average=average)
+        return reading, rng, rest(reading, rng.standard_normal(reading.read.size)), self.each("sensitivity", setup.axes)
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        from gyrostab.kernels.coloured import march
+
+        reading, rng, position, sensitivity = state
+        normal = rng.standard_normal((chunk.size, position.size + 1))
+        values, position = march(reading.step, reading.read, reading.kick, normal, position)
+        return sensitivity[:, None] * (chunk.drivers["vibration"] * values), (reading, rng, position, sensitivity)
+
+    def explain(self, windows: Windows) -> Prediction:
+        """The folded spectrum, the same process on all axes."""
+        from gyrostab.kernels.coloured import band_psd, folded_psd
+
+        def density(f: Array) -> Array:
+            return band_psd(f, self.low, self.high, resonance=self.resonance, quality=self.quality)
+
+        average = self.sampling == "average"
+        folded = folded_psd(density, windows.frequency, windows.rate, 3.0 * self.high, average=average)
+        power = windows.drivers["vibration"] ** 2
+        return Prediction(spectrum={"sensitivity": power[:, None] * folded}, coherent=True)
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        mount = f", behind a mount with a resonance at {self.quantity('resonance', errors)}" if self.resonance else ""
+        taken = "a point of it" if self.sampling == "point" else "its mean over the interval"
+        size = self.quantity("sensitivity", errors)
+        band = f"{self.low:.4g} to {self.high:.4g} Hz"
+        return f"Vibration at {band} folds into the samples {self.on_axes()}, with {size}{mount}; each sample is {taken}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Magnetic(_Vector):
+    """Bias that follows the magnetic field in the tool (Faraday effect in the coil).
+
+    ``b = m_x B_x + m_y B_y + m_z B_z`` for each axis that it acts on, B in the frame of the tool.
+
+    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps where the tool turns or passes casing.
+    *Window mean*: follows the field. *Spectrum*: a line at the frequency of rotation, with the phase of the field. *Axes*: every axis follows
+    the same field with factors of its own.
+
+    Confused with earth_rate (known amplitude, quadrature between the cross axes) and g_sensitivity (phase of gravity): the angle between field and gravity
+    in the tool separates them, best at two places with different fields.
+
+    References
+    ----------
+    Fizoptika, glossary of fiber-optic gyros (magnetic sensitivity). Sizes are estimates: 0.1 to 10 deg/h/G without a shield, which is
+    1e-3 to 0.1 deg/h/uT, and a hundredth of it with one; the earth's field is 25 to 65 uT.
+
+    Examples
+    --------
+    >>> Magnetic(x=0.002, axes=["z"]).say()
+    'The bias follows the magnetic field on axis z, by 0.002 deg/h/uT along x.'
+    """
+
+    name: ClassVar[str] = "magnetic"
+    short: ClassVar[str] = "bias follows the magnetic field"
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = dict.fromkeys(("mag_x", "mag_y", "mag_z"), INNER["magnetic"])
+    size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    references: ClassVar[tuple[str, ...]] = ("Fizoptika, glossary of fiber-optic gyros",)
+
+    x: float = parameter("deg/h/uT", "bias per microtesla along x", default=0.0, typical=1e-3, low=-10.0, high=10.0)
+    y: float = parameter("deg/h/uT", "bias per microtesla along y", default=0.0, typical=1e-3, low=-10.0, high=10.0)
+    z: float = parameter("deg/h/uT", "bias per microtesla along z", default=0.0, typical=1e-3, low=-10.0, high=10.0)
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        return f"The bias follows the magnetic field {self.on_axes()}, by {self.parts(errors)}."

@@ -1,0 +1,230 @@
+"""Gaussian processes of continuous time with a resonance or a band, read at the samples or averaged over each sample, without approximation.
+
+A process is white noise behind second-order sections in series. Its state is known from one sample to the next by the matrix
+exponential, and so are the joint distribution of the state and of the mean over the interval between (Van Loan 1978). So a process far above half of
+the sampling rate folds down as it does in a logger that samples it, and needs no finer time.
+
+References
+----------
+Van Loan 1978, IEEE Trans. Autom. Control 23, 395 (integrals of the matrix exponential).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+__all__ = ["ORDER", "Reading", "band", "band_psd", "folded_psd", "march", "oscillator", "oscillator_psd", "rest"]
+
+Array = NDArray[np.float64]
+
+#: Order of the Butterworth low-pass from which a band is made: the band has twice as many poles.
+ORDER = 6
+
+
+class Reading(NamedTuple):
+    """How a process goes on from sample to sample, and what is read of it."""
+
+    step: Array  # (d, d): state at the next sample from the state at this one
+    read: Array  # (d,): reading from the state at this sample
+    kick: Array  # (d + 1, d + 1): lower triangle; from standard normal numbers to the fresh parts of state and reading
+    spread: Array  # (d, d): from standard normal numbers to a state of the stationary process
+
+
+class _Section(NamedTuple):
+    """``velocity: a s / (s^2 + a s + w^2)``, one at w; or ``position: w^2 / (s^2 + a s + w^2)``, one at zero frequency."""
+
+    omega: float
+    damping: float
+    velocity: bool
+
+
+def _chain(sections: Sequence[_Section]) -> tuple[Array, Array, Array]:
+    """State matrix, input of white noise and output of sections in series; two states for each, both of the same size."""
+    size = 2 * len(sections)
+    a, b = np.zeros((size, size)), np.zeros(size)
+    drive = np.zeros(size)
+    for number, (omega, damping, velocity) in enumerate(sections):
+        position, speed = 2 * number, 2 * number + 1
+        a[position, speed] = omega
+        a[speed, position] = -omega
+        a[speed, speed] = -damping
+        gain = damping if velocity else omega
+        if number:
+            a[speed] += drive * gain
+        else:
+            b[speed] = gain
+        drive = np.zeros(size)
+        drive[speed if velocity else position] = 1.0
+    return a, b, drive
+
+
+def _factor(covariance: Array) -> Array:
+    """A lower triangle whose square is the covariance, which may be singular."""
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.ascontiguousarray(np.linalg.qr(root.T, mode="r").T)
+
+
+def _reading(a: Array, covariance: Array, c: Array, rate: float, *, average: bool) -> Reading:
+    """Sample a stationary process with state matrix `a` [s-1] and the output `c` at `rate` [Hz]."""
+    size = c.size
+    step = expm(a / rate)
+    total = np.zeros((size + 1, size + 1))
+    total[:size, :size] = covariance - step @ covariance @ step.T
+    read = c
+    if average:
+        once = np.linalg.solve(a, step - np.eye(size)) * rate
+        twice = 2.0 * rate * np.linalg.solve(a, once - np.eye(size))
+        read = c @ once
+        crossed = once @ covariance @ c - step @ (covariance @ read)
+        total[:size, size] = total[size, :size] = crossed
+        total[size, size] = c @ twice @ covariance @ c - read @ covariance @ read
+    return Reading(np.ascontiguousarray(step), np.ascontiguousarray(read), _factor(total), _factor(covariance))
+
+
+def oscillator(frequency: float, quality: float, rate: float, *, average: bool = True) -> Reading:
+    """The velocity of a damped oscillator shaken by white noise, of unit variance in continuous time.
+
+    Parameters
+    ----------
+    frequency : float
+        Undamped frequency [Hz].
+    quality : float
+        Frequency over width of the line.
+    rate : float
+        Sampling rate [Hz].
+    average : bool
+        Mean over each sample instead of the value at its beginning.
+    """
+    omega = 2.0 * math.pi * frequency
+    a, _, _ = _chain([_Section(omega, omega / quality, True)])
+    return _reading(a, np.eye(2), np.array([0.0, 1.0]), rate, average=average)
+
+
+def _band_sections(low: float, high: float) -> list[_Section]:
+    """Butterworth's band with half power at `low` and `high` [Hz]."""
+    width, centre = 2.0 * math.pi * (high - low), 2.0 * math.pi * math.sqrt(low * high)
+    angles = math.pi * (2.0 * np.arange(ORDER) + ORDER + 1.0) / (2.0 * ORDER)
+    half = np.exp(1j * angles) * width / 2.0
+    root = np.sqrt(half**2 - centre**2 + 0j)
+    poles = np.concatenate([half + root, half - root])
+    poles = poles[poles.imag > 0.0]  # one of each pair, whose product is real
+    return [_Section(float(abs(pole)), float(-2.0 * pole.real), True) for pole in sorted(poles, key=abs)]
+
+
+def band(low: float, high: float, rate: float, *, resonance: float = 0.0, quality: float = 1.0, average: bool = False) -> Reading:
+    """Noise of unit variance in a band, behind an optional mount.
+
+    Parameters
+    ----------
+    low, high : float
+        Frequencies of half power [Hz], with ``0 < low < high``.
+    rate : float
+        Sampling rate [Hz].
+    resonance, quality : float
+        Frequency [Hz] and quality of a mass on a spring that the noise goes through; its gain is one at low frequency. None at 0 Hz.
+    average : bool
+        Mean over each sample instead of the value at its beginning.
+    """
+    sections = _band_sections(low, high)
+    size = 2 * len(sections)
+    if resonance:
+        omega = 2.0 * math.pi * resonance
+        sections.append(_Section(omega, omega / quality, False))
+    a, b, c = _chain(sections)
+    covariance = solve_continuous_lyapunov(a, -np.outer(b, b))
+    power = covariance[size - 1, size - 1]  # of the band before the mount
+    return _reading(a, covariance / power, c, rate, average=average)
+
+
+def rest(reading: Reading, normal: Array) -> Array:
+    """A state of the stationary process, from standard normal numbers, one for each of its states."""
+    return np.asarray(reading.spread @ normal)
+
+
+@njit(cache=True, nogil=True)
+def march(step: Array, read: Array, kick: Array, normal: Array, position: Array) -> tuple[Array, Array]:
+    """Read the process at the samples.
+
+    Parameters
+    ----------
+    step, read, kick : ndarray
+        From `Reading`.
+    normal : ndarray, shape (n, d + 1)
+        Standard normal numbers.
+    position : ndarray, shape (d,)
+        State at the first sample.
+
+    Returns
+    -------
+    values : ndarray, shape (n,)
+    position : ndarray, shape (d,)
+        State after the last sample.
+    """
+    n, d = normal.shape[0], position.size
+    values = np.empty(n)
+    here, there = position.copy(), np.empty(d)
+    for i in range(n):
+        value = 0.0
+        for k in range(d):
+            value += read[k] * here[k]
+        for k in range(d + 1):
+            value += kick[d, k] * normal[i, k]
+        values[i] = value
+        for j in range(d):
+            x = 0.0
+            for k in range(d):
+                x += step[j, k] * here[k]
+            for k in range(j + 1):
+                x += kick[j, k] * normal[i, k]
+            there[j] = x
+        here, there = there, here
+    return values, here
+
+
+# ------------------------------------------------------------------------------------------------------------- the same in frequency
+
+
+def oscillator_psd(f: Array, frequency: float, quality: float) -> Array:
+    """Two-sided density [Hz-1] of `oscillator` in continuous time."""
+    width = frequency / quality
+    return np.asarray(width * f**2 / (math.pi * ((f**2 - frequency**2) ** 2 + (width * f) ** 2)))
+
+
+def band_psd(f: Array, low: float, high: float, *, resonance: float = 0.0, quality: float = 1.0) -> Array:
+    """Two-sided density [Hz-1] of `band` in continuous time."""
+    x = (f**2 - low * high) / ((high - low) * np.maximum(np.abs(f), 1e-9 * low))
+    share = math.pi / (2 * ORDER)
+    density = 0.5 / ((high - low) * share / math.sin(share)) / (1.0 + x ** (2 * ORDER))
+    if resonance:
+        density = density * resonance**4 / ((f**2 - resonance**2) ** 2 + (f * resonance / quality) ** 2)
+    return np.asarray(density)
+
+
+def folded_psd(density: Callable[[Array], Array], f: Array, rate: float, highest: float, *, average: bool) -> Array:
+    """Two-sided density of the samples of a process: the sum over the frequencies that look the same in them.
+
+    Parameters
+    ----------
+    density : callable
+        Two-sided density in continuous time.
+    f : ndarray, shape (n,)
+        Frequencies [Hz].
+    rate : float
+        Sampling rate [Hz].
+    highest : float
+        Frequency above which the process has no power [Hz].
+    average : bool
+        Every sample is the mean over its interval.
+    """
+    order = np.arange(-math.ceil(highest / rate) - 1, math.ceil(highest / rate) + 2)
+    every = np.asarray(f, np.float64)[..., None] + order * rate
+    response = np.sinc(every / rate) ** 2 if average else 1.0
+    return np.asarray((density(every) * response).sum(axis=-1))

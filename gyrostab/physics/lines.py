@@ -1,0 +1,184 @@
+"""Effects with a frequency of their own, or of the rotation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.phase import TURN, fold, line_density, turn_means, turns_of_samples, turns_of_windows
+from gyrostab.units import INNER
+
+__all__ = ["RotationLine", "SpectralLine"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpectralLine(Effect):
+    """A line at a frequency that does not move: steady, or a resonance of stated quality.
+
+    ``rate(t) = A sin(2 pi f t + phi)``; or, with a quality Q, the velocity of an oscillator of that frequency shaken by white noise, of
+    the same mean square ``A^2 / 2``, with the density ``(A^2 / 2) w f^2 / (pi ((f^2 - f0^2)^2 + w^2 f^2))`` and w = f0 / Q. Every sample is
+    the mean over its interval, so a line above half of the sampling rate folds down with the factor sinc(f / fs).
+
+    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``: a bump of 0.724 A^2 in the variance at tau = 0.371 / f, then combs that fall with 1 / tau in
+    sigma; a resonance has the bump without the combs. *Window mean*: nothing. *Spectrum*: a line, or a peak of width f0 / Q.
+    *Axes*: one motion, with a factor for each axis.
+
+    Confused with rotation_line and earth_rate (move with the rotation), feedback_reset (moves with the gyro's own rate) and
+    aliased_vibration (moves with the sampling rate, follows vibration): see whether f moves with rotation, temperature, sampling rate.
+
+    References
+    ----------
+    IEEE Std 952-1997, annex C (Allan variance of a sinusoid). Sizes are estimates: structures resonate at 20 to 2000 Hz with a quality of 5 to 50.
+
+    Examples
+    --------
+    >>> SpectralLine(amplitude=0.2, frequency=27.0, axes=["x"]).say()
+    'There is a steady line of 0.2 deg/h at 27 Hz on axis x.'
+    """
+
+    name: ClassVar[str] = "spectral_line"
+    short: ClassVar[str] = "steady line, resonance"
+    stage: ClassVar[Stage] = "rate"
+    size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
+    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
+
+    amplitude: tuple[float, ...] = parameter("deg/h", "amplitude, sqrt(2) times the rms", typical=0.2, low=-1e6, high=1e6, many=True)
+    frequency: float = parameter("Hz", "frequency", typical=2.7, low=1e-6, high=1e5)
+    quality: float = parameter("1", "frequency over width; inf for a steady line", default=math.inf, low=0.5)
+    phase: tuple[float, ...] = parameter("deg", "phase of a steady line at the start of the log", default=(), low=-1e6, high=1e6, many=True)
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """The oscillator in its stationary state; nothing for a steady line."""
+        if math.isinf(self.quality):
+            self.each("phase", setup.axes)
+            return None
+        from gyrostab.kernels.coloured import oscillator, rest
+
+        reading = oscillator(self.frequency, self.quality, setup.rate)
+        return reading, rng, rest(reading, rng.standard_normal(2))
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        amplitude = self.each("amplitude", chunk.setup.axes)[:, None]
+        if state is None:
+            cycles = self.frequency / chunk.rate
+            middle = (chunk.first + np.arange(chunk.size) + 0.5) * cycles
+            phase = np.radians(self.each("phase", chunk.setup.axes))[:, None] - math.pi / 2.0
+            return amplitude * turn_means(middle, np.asarray(cycles), phase), None
+        from gyrostab.kernels.coloured import march
+
+        reading, rng, position = state
+        values, position = march(reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position)
+        return amplitude / math.sqrt(2.0) * values, (reading, rng, position)
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """The frequency, band by band, and for a resonance its quality."""
+        grid = {"frequency": windows.frequency}
+        return grid if math.isinf(self.quality) else grid | {"quality": np.array([5.0, 15.0, 50.0])}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """A spectrum, the same process on all axes; and where the line shows."""
+        place = np.full(windows.begin.shape, float(fold(self.frequency, windows.rate)))
+        if math.isinf(self.quality):
+            power = 0.5 * np.sinc(self.frequency / windows.rate) ** 2
+            return Prediction(spectrum={"amplitude": line_density(windows, place, power)}, coherent=True, line=place)
+        from gyrostab.kernels.coloured import folded_psd, oscillator_psd
+
+        def density(f: Array) -> Array:
+            return oscillator_psd(f, self.frequency, self.quality)
+
+        highest = self.frequency * (1.0 + 20.0 / self.quality)
+        folded = 0.5 * folded_psd(density, windows.frequency, windows.rate, highest, average=True)
+        spectrum = np.broadcast_to(folded, (place.size, folded.size))
+        return Prediction(spectrum={"amplitude": spectrum}, coherent=True, line=place)
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        size, place = self.quantity("amplitude", errors), self.quantity("frequency", errors)
+        if math.isinf(self.quality):
+            return f"There is a steady line of {size} at {place} {self.on_axes()}."
+        return f"There is a resonance of {size} at {place} with a quality of {self.quantity('quality', errors)} {self.on_axes()}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotationLine(Effect):
+    """Lines locked to the rotation of the tool, or with another driver to the strokes of a pump or the modes of stick-slip.
+
+    ``rate(t) = sum_k A k^-p cos(k (m theta(t) + phi))`` over k = 1 to `harmonics`, theta the turns of the channel since the start of
+    the log, m the `order`: lines in a turn. The phase is the integral of the channel, carried on from sample to sample, and each sample is the
+    mean over its interval, so a line folds where its frequency passes half of the sampling rate.
+
+    *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f wanders inside a window; it moves to shorter times as the tool speeds up.
+    *Window mean*: nothing while it turns; ``A cos(phi)`` of the standing tool. *Spectrum*: a comb that follows the rotation.
+    *Axes*: phase locked, with amplitude and phase of each axis.
+
+    Confused with earth_rate (15 deg/h at most, quadrature between the cross axes), g_sensitivity and magnetic (proportional to their channels),
+    and spectral_line (does not move): see whether the line moves with the rotation, and with which multiple.
+
+    References
+    ----------
+    No published sizes; estimates: pumps 1 to 6 Hz, stick-slip 0.1 to 0.5 Hz with 0 to 2 times the mean rotation rate, whirl 5 to 20 Hz.
+
+    Examples
+    --------
+    >>> RotationLine(amplitude=0.5, harmonics=3, axes=["x"]).say()
+    'There are 3 lines locked to rotation_rate on axis x, the first of 0.5 deg/h at 1 per turn.'
+    """
+
+    name: ClassVar[str] = "rotation_line"
+    short: ClassVar[str] = "lines locked to tool rotation, pump or stick-slip"
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
+    size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
+
+    amplitude: tuple[float, ...] = parameter("deg/h", "amplitude of the first line", typical=0.5, low=-1e6, high=1e6, many=True)
+    order: float = parameter("1", "frequency of the first line [per turn]", default=1.0, low=1e-3, high=1e3)
+    harmonics: float = parameter("1", "number of lines", default=1.0, low=1.0, high=100.0)
+    rolloff: float = parameter("1", "the k-th line is k^-rolloff of the first", default=1.0, low=-5.0, high=5.0)
+    phase: tuple[float, ...] = parameter("deg", "phase of the first line at the start of the log", default=(), low=-1e6, high=1e6, many=True)
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """Turns of the channel so far."""
+        return 0.0
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        middle, inside, state = turns_of_samples(self.order * chunk.drivers["rotation_rate"], chunk.rate, state)
+        return self._lines(middle, inside, chunk.setup.axes, self.each("amplitude", chunk.setup.axes)), state
+
+    def _lines(self, middle: Array, inside: Array, axes: tuple[str, ...], amplitude: Array) -> Array:
+        """Sum of the lines over intervals, of amplitude one."""
+        total = np.zeros((len(axes), middle.size))
+        phase = np.radians(self.each("phase", axes))[:, None]
+        for k in range(1, int(self.harmonics) + 1):
+            total += k**-self.rolloff * turn_means(k * middle, k * inside, k * phase)
+        return amplitude[:, None] * total
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """The phase, half a turn of it since the amplitude has a sign, and the lines in a turn."""
+        return {"phase": np.arange(0.0, 180.0, 30.0), "order": np.array([1.0, 2.0, 3.0, 4.0])}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means where the tool all but stands; the comb; where the lines show."""
+        rotation = self.order * windows.drivers["rotation_rate"]
+        middle, inside = turns_of_windows(windows, rotation)
+        mean = self._lines(middle, inside, windows.axes, np.ones(len(windows.axes)))
+        k = np.arange(1.0, int(self.harmonics) + 1)[:, None]
+        cycles = k * np.abs(rotation) / TURN
+        place = fold(cycles, windows.rate)
+        power = 0.5 * (k**-self.rolloff * np.sinc(cycles / windows.rate)) ** 2
+        comb = sum((line_density(windows, one, weight) for one, weight in zip(place, power, strict=True)), np.zeros(()))
+        return Prediction(mean={"amplitude": mean}, spectrum={"amplitude": comb}, line=place)
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        count, channel = int(self.harmonics), self.channel_names()["rotation_rate"]
+        many = "There is a line" if count == 1 else f"There are {count} lines"
+        first = "of" if count == 1 else "the first of"
+        size, order = self.quantity("amplitude", errors), self.quantity("order", errors)
+        return f"{many} locked to {channel} {self.on_axes()}, {first} {size} at {order} per turn."
