@@ -72,6 +72,7 @@ def make_log(
     if parsed.quantity != kind:
         raise OptionError(f"unit {unit!r} is a unit of {parsed.quantity}, but kind is {kind!r}")
     data = values if hasattr(values, "ndim") else np.asarray(values)
+    packing = {"dtype": data.dtype, "scale_factor": parsed.factor} if data.dtype.kind in "iu" else {}
     data = data[None, :] if data.ndim == 1 else data
     names = list(axis) if axis is not None else list("xyz")[: data.shape[0]]
     if data.ndim != 2 or len(names) != data.shape[0]:
@@ -79,8 +80,9 @@ def make_log(
     if parsed.factor != 1.0:
         data = data * parsed.factor
     coordinates = time_coordinate(int(pd.Timestamp(start).as_unit("ns").value), rate, data.shape[1])
+    attrs = {"units": SIGNAL_UNITS[kind], "long_name": "rotation rate" if kind == "rate" else "angle"}
     log = xr.Dataset(
-        {kind: (("axis", "time"), data, {"units": SIGNAL_UNITS[kind], "long_name": "rotation rate" if kind == "rate" else "angle"})},
+        {kind: (("axis", "time"), data, attrs, packing)},
         coords=coordinates,
         attrs={"sampling_rate_hz": float(rate), "kind": kind},
     ).assign_coords(axis=names)

@@ -21,14 +21,13 @@ from gyrostab.join.lazy import chunk_of, lay
 from gyrostab.join.notes import some, together
 from gyrostab.join.place import place_logs
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
+from gyrostab.store import common_packing
 from gyrostab.timegrid import grid_times, time_coordinate
 
 __all__ = ["join_logs", "log_span"]
 
 #: What the clocks of two loggers, or of one that is now hot and now cold, may differ by; more is another rate.
 RATE_TOLERANCE = 1e-4
-
-_PACKING = ("dtype", "scale_factor", "add_offset")
 
 
 def join_logs(
@@ -85,7 +84,7 @@ def join_logs(
     signal = xr.Variable(
         ("axis", "time"), lay([_parts(pieces, name, axis) for axis in axes], size, chunk), _signal_attributes(sources, name)
     )
-    signal.encoding = _packing(sources, name)
+    signal.encoding = common_packing(source.log[name].encoding for source in sources)
     channels, stamps = join_channels(pieces, start, rate, size, chunk)
     coordinates = xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps}).merge(time_coordinate(start, rate, size)).coords
     variables = {name: signal, **channels, **gap_variables(name_lost(join_gaps(pieces), lost, start, rate), start, rate)}
@@ -135,13 +134,6 @@ def _parts(pieces: Sequence[Piece], name: str, axis: str) -> list[Any]:
 
 def _signal_attributes(sources: Sequence[Source], name: str) -> dict[str, Any]:
     return {**sources[0].log[name].attrs, "units": SIGNAL_UNITS[name]}
-
-
-def _packing(sources: Sequence[Source], name: str) -> dict[str, Any]:
-    """How integers of the source are stored, where all logs agree on it."""
-    found = [{key: source.log[name].encoding.get(key) for key in _PACKING} for source in sources]
-    alike = all(one == found[0] for one in found) and found[0]["scale_factor"] is not None
-    return {key: value for key, value in found[0].items() if value is not None} if alike else {}
 
 
 def _absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:

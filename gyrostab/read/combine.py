@@ -14,6 +14,7 @@ from gyrostab.join import some, together
 from gyrostab.read.buffers import park
 from gyrostab.read.overlap import drop_repeats
 from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.store import common_packing
 
 __all__ = ["attach_channels", "concatenate", "memory", "to_disk"]
 
@@ -25,7 +26,8 @@ def memory(part: xr.Dataset) -> int:
 
 def to_disk(part: xr.Dataset) -> xr.Dataset:
     """The same raw log with its columns in unlinked temporary files."""
-    return part.assign({name: (part[name].dims, park(part[name].values), part[name].attrs) for name in part.variables if name != "axis"})
+    long = {name: variable for name, variable in part.variables.items() if name != "axis"}
+    return part.assign({name: (v.dims, park(v.values), v.attrs, v.encoding) for name, v in long.items()})
 
 
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -99,12 +101,14 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
             rows.append(_end_to_end([_axis(part, signal, axis) for part in parts]))
             absent[f"axis {axis}"] = [name for name, part in zip(names, parts, strict=True) if axis not in part["axis"].values]
         stack = np.stack(rows) if isinstance(rows[0], np.ndarray) else _dask().stack(rows)
-        data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]})
+        packing = common_packing(part[signal].encoding for part in parts)
+        data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]}, packing)
         coords["axis"] = np.array(axes, dtype=str)
     for channel in dict.fromkeys(str(name) for part in parts for name in part.data_vars if name != signal):
         units = _channel_units(parts, channel)
         columns = [part[channel].data if channel in part else np.full(size, np.nan) for part, size in zip(parts, sizes, strict=True)]
-        data[channel] = ("row", _end_to_end(columns), {"units": units})
+        packing = common_packing(part[channel].encoding for part in parts if channel in part)
+        data[channel] = ("row", _end_to_end(columns), {"units": units}, packing)
         absent[f"channel {channel}"] = [name for name, part in zip(names, parts, strict=True) if channel not in part]
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     gaps = [f"{what} is not in {some(files)} and is missing there" for what, files in absent.items() if files]

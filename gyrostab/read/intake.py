@@ -57,6 +57,7 @@ class Intake:
         self.cell_places: list[str] = []
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
+        self.whole: dict[int, tuple[float, float] | None] = {column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]}
 
     def add(self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0, locate: Locate | None = None) -> None:
         """Take one block.
@@ -94,10 +95,10 @@ class Intake:
             block[self.time.source] = stamps
         self.buffers.add(block)
 
-    @staticmethod
-    def _clean(column: Column, values: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+    def _clean(self, column: Column, values: NDArray[np.float64]) -> NDArray[np.bool_] | None:
         """Convert to the inner unit in place, infinities to NaN; the mask of what is missing, or None when nothing is."""
         finite = np.isfinite(values)
+        self._note_whole(column, values if finite.all() else values[finite])
         if column.factor != 1.0:
             values *= column.factor
         if column.offset != 0.0:
@@ -107,6 +108,25 @@ class Intake:
         missing = ~finite
         values[missing] = np.nan
         return missing
+
+    def _note_whole(self, column: Column, values: NDArray[np.float64]) -> None:
+        """Keep the span of a column of whole numbers, as long as it is one."""
+        span = self.whole[column.source]
+        if span is None or not len(values):
+            return
+        head = values[:1000]
+        is_whole = bool((head == np.rint(head)).all() and (values == np.rint(values)).all())
+        self.whole[column.source] = (min(span[0], float(values.min())), max(span[1], float(values.max()))) if is_whole else None
+
+    def _packing(self, columns: Sequence[Column]) -> dict[str, Any]:
+        """The encoding of columns of whole numbers that have one factor; none for others."""
+        spans = [self.whole[column.source] for column in columns]
+        factors = {column.factor for column in columns if column.offset == 0.0}
+        if None in spans or len(factors) != 1 or any(column.offset != 0.0 for column in columns):
+            return {}
+        reach = max(max(-low, high) for low, high in filter(None, spans))
+        dtype = next((kind for kind in ("int16", "int32") if reach < np.iinfo(kind).max), None)
+        return {"dtype": np.dtype(dtype), "scale_factor": factors.pop()} if dtype else {}
 
     def _note_rows(self, rows: NDArray[np.int64], locate: Locate) -> None:
         self.bad_rows += len(rows)
@@ -167,10 +187,10 @@ class Intake:
             axes = [column.name for column in self.gyro]
             parts = [columns[column.source] for column in self.gyro]
             stack = np.stack(parts) if isinstance(parts[0], np.ndarray) else _dask_stack(parts)
-            data[self.plan.signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[self.plan.signal]})
+            data[self.plan.signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[self.plan.signal]}, self._packing(self.gyro))
             coords["axis"] = np.array(axes, dtype=str)
         for column in self.channels:
-            data[column.name] = ("row", columns[column.source], {"units": column.units})
+            data[column.name] = ("row", columns[column.source], {"units": column.units}, self._packing([column]))
         if stamps is not None:
             coords["time"] = ("row", stamps)
         dataset = xr.Dataset(data, coords=coords, attrs={"kind": self.plan.kind} if self.plan.kind else {})

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -197,7 +197,20 @@ def _look(path: Path, file: Any, options: ReadOptions) -> tuple[list[_Column], i
         notes.append(f"left out, as they do not run along {dim!r} alone: {', '.join(left[:20])}")
     units = {index: str(column.variable.units) for index, column in enumerate(columns) if "units" in column.variable.ncattrs()}
     plan = plan_columns(path, [column.header for column in columns], options, units=units)
-    return columns, len(file.dimensions[dim]), plan, notes
+    return columns, len(file.dimensions[dim]), _with_own_factors(plan, columns), notes
+
+
+def _with_own_factors(plan: Plan, columns: list[_Column]) -> Plan:
+    """Read the counts of packed variables, and take their factor and that of the unit as one."""
+    found = []
+    for column in plan.columns:
+        variable = columns[column.source].variable
+        attrs = variable.ncattrs()
+        if column.role != "time" and "scale_factor" in attrs and not getattr(variable, "add_offset", 0):
+            variable.set_auto_scale(False)
+            column = replace(column, factor=column.factor * float(variable.scale_factor))
+        found.append(column)
+    return replace(plan, columns=tuple(found))
 
 
 def _columns(file: Any, variable: Any, dim: str) -> list[_Column]:

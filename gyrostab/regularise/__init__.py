@@ -22,6 +22,7 @@ from gyrostab.regularise.place import Placement, place_by_count, place_by_stamp,
 from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_rate, odd_stretches
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name
+from gyrostab.store import chunk_samples
 from gyrostab.timegrid import time_coordinate
 
 __all__ = ["gap_table", "regularise"]
@@ -40,12 +41,12 @@ def _seconds(max_gap: Any) -> float:
     return seconds
 
 
-def _checked(*, rate: float | None, tolerance: float, chunk: int, block: int) -> None:
+def _checked(*, rate: float | None, tolerance: float, chunk: int | None, block: int) -> None:
     if rate is not None and not (math.isfinite(rate) and rate > 0):
         raise OptionError(f"rate={rate!r} is not a sampling rate; give a number of Hz above 0")
     if not 0 <= tolerance < 0.5:
         raise OptionError(f"tolerance={tolerance!r} must be at least 0 and below 0.5 samples")
-    if chunk < 1 or block < 64:
+    if (chunk is not None and chunk < 1) or block < 64:
         raise OptionError(f"chunk={chunk!r} and block={block!r} count samples and rows; give at least 1 and 64")
 
 
@@ -108,10 +109,10 @@ def _channels(raw: xr.Dataset, found: Survey, placement: Placement, rate: float,
     for name, rows in found.filled.items():
         channel = raw[name]
         if rows > 0.5 * (found.rows - found.absent):
-            variables[name] = ("time", on_grid(channel.data, placement, chunk=chunk), channel.attrs)
+            variables[name] = ("time", on_grid(channel.data, placement, chunk=chunk), channel.attrs, channel.encoding)
         elif rows:
             time, values = gathered(raw, name, placement, rate)
-            variables[name] = (f"time_{name}", values, channel.attrs)
+            variables[name] = (f"time_{name}", values, channel.attrs, channel.encoding)
             coordinates[f"time_{name}"] = time
     for key, variable in raw.data_vars.items():
         if variable.dims == (f"time_{key}",):
@@ -135,7 +136,7 @@ def regularise(
     rate: float | None = None,
     tolerance: float = 0.25,
     max_gap: str | float = "10D",
-    chunk: int = 1_200_000,
+    chunk: int | None = None,
     block: int = BLOCK,
 ) -> xr.Dataset:
     """Put the rows of a raw log on a uniform time axis, with NaN at every missing sample and a table of gaps.
@@ -151,8 +152,8 @@ def regularise(
         How much further than half a sample the slow course of the stamps may depart from the grid before a sample is left out [samples].
     max_gap : str or float
         A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number is in seconds.
-    chunk : int
-        Samples of a chunk of the lazy arrays.
+    chunk : int, optional
+        Samples of a chunk of the lazy arrays; about 20 minutes by default, as in a stored log.
     block : int
         Rows in memory at one time; the result does not depend on it.
 
@@ -196,6 +197,7 @@ def regularise(
     found = survey(raw, name, block=block)
     notes: list[str] = []
     placement, hertz = _place(raw, found, _declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block, notes=notes)
+    chunk = chunk or chunk_samples(hertz)
     table = name_lost(find_gaps(placement, found), raw.attrs.get("unreadable_spans", ()), placement.start, hertz)
     notes += describe(raw, found, placement, table, hertz)
 
@@ -203,9 +205,11 @@ def regularise(
     signal = "rate" if increments else name
     scale = hertz * 3600.0 if increments else 1.0  # degree a sample to degree an hour
     attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
+    unit = raw[name].encoding.get("scale_factor")
+    packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}
     variables, own = _channels(raw, found, placement, hertz, chunk)
     variables = {
-        signal: (("axis", "time"), on_grid(raw[name].data, placement, chunk=chunk, scale=scale), attributes),
+        signal: (("axis", "time"), on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit), attributes, packing),
         **variables,
         **gap_variables(table, placement.start, hertz),
     }

@@ -20,13 +20,15 @@ __all__ = ["SMALL", "gathered", "on_grid", "samples_of"]
 SMALL = 2_000_000
 
 
-def _fill(rows: NDArray[Any], *, runs: NDArray[np.int64], size: int, scale: float) -> NDArray[np.float64]:
+def _fill(rows: NDArray[Any], *, runs: NDArray[np.int64], size: int, scale: float, unit: float | None = None) -> NDArray[np.float64]:
     """Rows (last dimension) to samples; `runs` count samples and rows from the beginning of both."""
     out = np.full((*rows.shape[:-1], size), np.nan)
     for sample, row, length in runs:
         out[..., sample : sample + length] = rows[..., row : row + length]
     out[np.isinf(out)] = np.nan
-    return out if scale == 1.0 else out * scale
+    if scale != 1.0:
+        out = out * scale if unit is None else np.rint(out / unit) * (unit * scale)
+    return out
 
 
 def _cut(runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int) -> NDArray[np.int64]:
@@ -37,7 +39,7 @@ def _cut(runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int)
     return np.stack([first - begin, part[:, 1] + first - part[:, 0], last - first], axis=1)
 
 
-def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0) -> Any:
+def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, unit: float | None = None) -> Any:
     """Turn an array by row into an array by sample, float64, NaN where there is no row and where a value is infinite.
 
     Parameters
@@ -49,6 +51,8 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0) 
         Samples of a chunk of the result.
     scale : float
         Factor on the values.
+    unit : float, optional
+        The values are whole multiples of this; they remain whole multiples of ``unit * scale``, to the last bit.
 
     Returns
     -------
@@ -57,7 +61,7 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0) 
     """
     size, lead = placement.size, rows.shape[:-1]
     if size * max(1, int(np.prod(lead))) <= SMALL:
-        return _fill(np.asarray(rows), runs=placement.runs, size=size, scale=scale)
+        return _fill(np.asarray(rows), runs=placement.runs, size=size, scale=scale, unit=unit)
     lazy = rows if isinstance(rows, da.Array) else da.from_array(rows, chunks=(*lead, BLOCK), name=False)
     ends = placement.runs[:, 0] + placement.runs[:, 2]
     parts, empty = [], 0
@@ -79,7 +83,7 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0) 
         runs[:, 1] -= first
         source = lazy[..., first:last].rechunk(-1)
         shape = (*((n,) for n in lead), (end - begin,))
-        parts.append(source.map_blocks(_fill, runs=runs, size=end - begin, scale=scale, dtype=np.float64, chunks=shape))
+        parts.append(source.map_blocks(_fill, runs=runs, size=end - begin, scale=scale, unit=unit, dtype=np.float64, chunks=shape))
     flush()
     return da.concatenate(parts, axis=-1)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.counts import to_counts
 from gyrostab.store.lock import library_lock
 
-__all__ = ["Misfit", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "long_variables"]
+__all__ = ["Misfit", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "common_packing", "long_variables"]
 
 CHUNK_SECONDS = 1200.0
 #: Bounds of the samples in one chunk, for very slow and very fast logs.
@@ -66,6 +66,24 @@ def _counts(values: NDArray[np.float64], *, name: str, scale: float, dtype: str)
     if counts is None:
         raise Misfit(name)
     return counts
+
+
+def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
+    """How the same variable of several logs is stored when they are joined: as counts, where all are counts of one factor.
+
+    Examples
+    --------
+    >>> common_packing([{"dtype": "i2", "scale_factor": 0.1}, {"dtype": "i4", "scale_factor": 0.1}])
+    {'dtype': dtype('int32'), 'scale_factor': 0.1}
+    >>> common_packing([{"dtype": "i2", "scale_factor": 0.1}, {}])
+    {}
+    """
+    found = list(encodings)
+    scales = {encoding.get("scale_factor") for encoding in found}
+    scale = scales.pop() if len(scales) == 1 else None
+    if scale is None or not all("dtype" in encoding for encoding in found):
+        return {}
+    return {"dtype": np.result_type(*(np.dtype(encoding["dtype"]) for encoding in found)), "scale_factor": float(scale)}
 
 
 def long_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
