@@ -67,33 +67,35 @@ def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, flo
 
 
 @njit(cache=True, nogil=True)
-def ornstein_uhlenbeck(normal: Array, decay: Array, weight: Array, position: Array) -> tuple[Array, Array]:
-    """Sum, at the two ends of every sample, of Ornstein-Uhlenbeck processes of unit variance.
+def ornstein_uhlenbeck(normal: Array, decay: Array, weight: Array, rest: float, position: Array) -> tuple[Array, Array]:
+    """Sum of the means over every sample of Ornstein-Uhlenbeck processes of unit variance.
 
     Parameters
     ----------
-    normal : ndarray, shape (n, m)
-        Standard normal numbers, one for each sample and process.
+    normal : ndarray, shape (n, m + 1)
+        Standard normal numbers for each sample: one for each process, one for what the means do beyond their ends.
     decay : ndarray, shape (m,)
         ``1 - exp(-1 / T)`` for the correlation times T [samples].
     weight : ndarray, shape (m,)
-        Factor of each process in the sum of both ends.
+        Factor of each process's ends in its mean.
+    rest : float
+        Standard deviation of the sum of the means, given the ends.
     position : ndarray, shape (m,)
         Where the processes are at the start of the first sample.
 
     Returns
     -------
     total : ndarray, shape (n,)
-        Sum over the processes of ``weight * (start + end)``.
+        Sum over the processes of ``weight * (start + end)``, and the rest.
     position : ndarray, shape (m,)
         Where they are at the end of the last sample.
     """
-    n, m = normal.shape
+    n, m = normal.shape[0], position.size
     total = np.empty(n)
     x = position.copy()
     kick = np.sqrt(decay * (2.0 - decay))
     for i in range(n):
-        s = 0.0
+        s = rest * normal[i, m]
         for j in range(m):
             before = x[j]
             x[j] = before - decay[j] * before + kick[j] * normal[i, j]
@@ -138,8 +140,8 @@ def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> 
     (array([0.6321, 0.2325, 0.0855]), 0.0498)
     """
     decay, weight, rest = _moments(np.array([float(samples)]))
-    total, last = ornstein_uhlenbeck(np.ascontiguousarray(normal[:, :1]), decay, weight, np.array([position]))
-    return total + math.sqrt(rest[0]) * normal[:, 1], float(last[0])
+    total, last = ornstein_uhlenbeck(normal, decay, weight, math.sqrt(rest[0]), np.array([position]))
+    return total, float(last[0])
 
 
 def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Array:
@@ -180,8 +182,8 @@ def flicker_means(normal: Array, times: Array, rate: float, position: Array, *, 
     inner = rest.sum()
     if endless:  # sum of 2 T over the correlation times that would follow; together they are white
         inner += 2.0 * times[-1] * rate / (RATIO - 1.0)
-    total, last = ornstein_uhlenbeck(np.ascontiguousarray(normal[:, :-1]), decay, weight, position)
-    return math.sqrt(variance) * (total + math.sqrt(inner) * normal[:, -1]), last
+    total, last = ornstein_uhlenbeck(normal, decay, weight, math.sqrt(inner), position)
+    return math.sqrt(variance) * total, last
 
 
 def sinusoid_means(index: NDArray[np.int64], frequency: float, rate: float, phase: float) -> Array:

@@ -1,0 +1,210 @@
+"""Simulated noise against the laws of the table, the spectrum, and itself in other chunks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from gyrostab.errors import OptionError
+from gyrostab.kernels.stochastic import RATIO, brownian_means, flicker_times
+from gyrostab.noise import LAWS, URAD_PER_S
+from gyrostab.simulate.noise import FLICKER_LOW, begin_noise, draw, make_noise, shape
+
+RATE = 50.0
+LENGTH, RECORDS = 500, 5000
+TAUS = np.unique(np.geomspace(1, LENGTH // 10, 12).astype(int))
+SIZES = {"Q": 0.5, "N": 0.01, "B": 0.1, "K": 0.3, "R": 1.0}
+MARKOV = (0.2, 0.15)  # deg/h, s
+SINE = (0.3, 2.3, 0.4)  # deg/h, Hz, rad
+
+
+def allan(records: np.ndarray, k: int, rate: float = RATE) -> float:
+    """Ensemble mean of the overlapping Allan variance of `records` (record, time) at k samples."""
+    angle = np.cumsum(np.pad(records, ((0, 0), (1, 0))), axis=1) / rate
+    second = angle[:, 2 * k :] - 2 * angle[:, k:-k] + angle[:, : -2 * k]
+    return float((second**2).mean() / (2 * (k / rate) ** 2))
+
+
+def markov_avar(tau: np.ndarray | float, sigma: float, time: float) -> np.ndarray:
+    """Allan variance of a first-order Gauss-Markov process, IEEE Std 952: (q T)^2 / tau (1 - ...), with q^2 T / 2 = sigma^2."""
+    x = np.asarray(tau, float) / time
+    exact = 2 / x * (1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
+    return sigma**2 * np.where(x < 1e-3, 2 * x / 3 * (1 - 0.75 * x), exact)
+
+
+def laws(term: str, tau: np.ndarray) -> np.ndarray:
+    if term == "gauss_markov":
+        return markov_avar(tau, *MARKOV)
+    if term == "sinusoid":
+        amplitude, frequency, _ = SINE
+        u = np.pi * frequency * tau
+        return amplitude**2 * np.sin(u) ** 4 / u**2
+    return LAWS[term].avar(tau, SIZES[term])
+
+
+def records(term: str) -> np.ndarray:
+    size = {"gauss_markov": MARKOV, "sinusoid": SINE}.get(term) or SIZES[term]
+    return make_noise(rate=RATE, size=LENGTH * RECORDS, seed=3, **{term: size}).reshape(RECORDS, LENGTH)
+
+
+@pytest.fixture(scope="module")
+def ensembles() -> dict[str, np.ndarray]:
+    return {}
+
+
+@pytest.mark.parametrize("term", [*"QNBKR", "gauss_markov", "sinusoid"])
+def test_ensemble_allan_variance_is_the_law_at_every_tau(term, ensembles):
+    """From one sample to a tenth of the record, within 2 % (the ensemble itself scatters by 0.7 % at the longest)."""
+    ensembles[term] = made = records(term)
+    found = np.array([allan(made, int(k)) for k in TAUS])
+    expected = laws(term, TAUS / RATE)
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=2e-4 * expected.max() if term == "sinusoid" else 0.0)
+
+
+@pytest.mark.parametrize("term", [*"QNBK", "gauss_markov"])
+def test_ensemble_spectrum_integrates_to_the_law(term, ensembles):
+    """P16 Eq. 7 on the spectrum of the samples: sigma^2 = int S(f) 2 sin^4(pi f tau) / (k sin(pi f dt))^2 df over all f that there are.
+
+    For samples, whose angle is a sum, (k sin(pi f dt))^2 stands for (pi f tau)^2; aliases are in S already.
+    """
+    made = ensembles.get(term)
+    made = (records(term) if made is None else made).reshape(-1, 4000)
+    window = np.hanning(4001)[:-1]
+    flat = made - made.mean(axis=1, keepdims=True)
+    power = np.abs(np.fft.rfft(flat * window, axis=1)) ** 2
+    density = power.mean(axis=0) / (window**2).sum() / RATE  # two-sided
+    f = np.fft.rfftfreq(4000, 1 / RATE)[1:]
+    for k in (1, 2, 5, 10, 20):
+        transfer = 2 * np.sin(np.pi * f * k / RATE) ** 4 / (k * np.sin(np.pi * f / RATE)) ** 2
+        weight = np.where(f == RATE / 2, 1.0, 2.0)
+        found = float((weight * density[1:] * transfer).sum() * RATE / 4000)
+        assert found == pytest.approx(float(laws(term, np.array(k / RATE))), rel=0.02), k
+
+
+@pytest.mark.parametrize("tau", [0.02, 0.3, 5.0])
+def test_gauss_markov_and_sinusoid_are_the_integral_of_their_spectra(tau):
+    """P16 Eq. 7: 4 int_0^inf S(f) sin^4(pi f tau) / (pi f tau)^2 df."""
+    sigma, time = MARKOV
+
+    def integrand(f):
+        return 4 * 2 * sigma**2 * time / (1 + (2 * np.pi * f * time) ** 2) * np.sin(np.pi * f * tau) ** 4 / (np.pi * f * tau) ** 2
+
+    total = sum(quad(integrand, j / tau, (j + 1) / tau, epsrel=1e-9)[0] for j in range(300))
+    assert total == pytest.approx(float(markov_avar(tau, *MARKOV)), rel=1e-3)
+    # a line of amplitude A is A^2 / 4 at +f and at -f; the integral counts +f and doubles it twice
+    amplitude, frequency, _ = SINE
+    u = np.pi * frequency * tau
+    assert float(laws("sinusoid", np.array(tau))) == pytest.approx(4 * amplitude**2 / 4 * np.sin(u) ** 4 / u**2, rel=1e-12)
+
+
+def test_the_bump_of_a_sinusoid_is_at_0_371_over_its_frequency():
+    tau = np.linspace(0.1, 1.0, 20001) / SINE[1]
+    assert tau[np.argmax(laws("sinusoid", tau))] * SINE[1] == pytest.approx(0.371, abs=5e-4)
+
+
+@pytest.mark.parametrize("rate", [0.1, 10.0, 400.0, 2000.0])
+def test_flicker_is_flat_from_one_sample_to_twenty_hours(rate):
+    """The exact Allan variance of the sum of processes, with what is faster than a sample as white noise of its mean."""
+    times = flicker_times(rate, low=FLICKER_LOW)
+    tau = np.geomspace(1 / rate, 72000.0, 300)
+    share = np.log(RATIO) / np.pi
+    found = sum(share * markov_avar(tau, 1.0, time) for time in times)
+    faster = times[-1] / RATIO ** np.arange(1, 40)
+    found = found + share * 2 * faster.sum() / tau
+    np.testing.assert_allclose(found, LAWS["B"].avar(tau), rtol=0.004)
+    assert times[-1] <= 1 / rate / 12
+
+
+def test_flicker_keeps_to_its_band():
+    band = make_noise(rate=100.0, size=2**17, B=1.0, seed=2, flicker_band=(0.1, 5.0))
+    power = np.abs(np.fft.rfft(band)) ** 2 / band.size / 100.0
+    f = np.fft.rfftfreq(band.size, 0.01)
+    law = 1 / (2 * np.pi * np.maximum(f, 1e-9))
+
+    def share(low, high):
+        part = (f > low) & (f < high)
+        return power[part].mean() / law[part].mean()
+
+    assert share(0.4, 1.5) == pytest.approx(1.0, abs=0.1)
+    assert share(0.003, 0.01) < 0.15
+    assert share(30.0, 50.0) < 0.35  # falls off with one more power of f
+
+
+def test_random_walk_is_averaged_not_sampled():
+    """Samples of a random walk have (K^2 tau / 3) (1 + 1 / (2 k^2)), half as much again at one sample; means have K^2 tau / 3."""
+    rng = np.random.default_rng(1)
+    steps = rng.standard_normal((RECORDS, 60))
+    sampled = np.cumsum(steps, axis=1)
+    averaged = np.stack([brownian_means(row, rng.standard_normal(60), 0.0)[0] for row in steps])
+    for k in (1, 2, 5):
+        assert allan(sampled, k, 1.0) == pytest.approx(k / 3 * (1 + 1 / (2 * k**2)), rel=0.02)
+        assert allan(averaged, k, 1.0) == pytest.approx(k / 3, rel=0.02)
+
+
+def test_quantization_is_a_bounded_error_of_the_angle():
+    rate = make_noise(rate=RATE, size=20_000, Q=0.5, seed=1)
+    angle = np.cumsum(rate) / RATE / URAD_PER_S
+    assert np.ptp(angle) <= 0.5 * np.sqrt(12)  # one least significant bit
+    assert angle.std() == pytest.approx(0.5, rel=0.03)
+    assert np.abs(np.corrcoef(angle[1:], angle[:-1])[0, 1]) < 0.02
+
+
+# ---------------------------------------------------------------------------------------------------------------- streams
+
+ALL = {**SIZES, "gauss_markov": MARKOV, "sinusoid": SINE}
+
+
+@settings(max_examples=10, deadline=None)
+@given(chunk=st.integers(1, 700), lazy=st.booleans(), seed=st.integers(0, 2**40))
+def test_chunks_do_not_change_a_bit(chunk, lazy, seed):
+    whole = make_noise(rate=RATE, size=600, seed=seed, **ALL)
+    cut = make_noise(rate=RATE, size=600, seed=seed, chunk=max(chunk, 60) if lazy else max(chunk, 3), lazy=lazy, **ALL)
+    np.testing.assert_array_equal(np.asarray(cut), whole)
+
+
+def test_a_longer_record_begins_like_a_shorter_one():
+    np.testing.assert_array_equal(make_noise(rate=RATE, size=2000, **ALL)[:700], make_noise(rate=RATE, size=700, **ALL))
+
+
+def test_each_term_is_the_same_with_and_without_the_others():
+    parts = sum(make_noise(rate=RATE, size=3000, seed=7, **{name: size}) for name, size in ALL.items())
+    np.testing.assert_allclose(make_noise(rate=RATE, size=3000, seed=7, **ALL), parts, rtol=0, atol=1e-9)
+
+
+def test_axes_and_seeds_are_independent():
+    given_size = {"rate": RATE, "size": 40_000, "N": 0.01}
+    made = [make_noise(seed=seed, axis=axis, **given_size) for seed in (1, 2) for axis in "xyz"]
+    correlation = np.corrcoef(made) - np.eye(6)
+    assert np.abs(correlation).max() < 4.5 / np.sqrt(40_000)
+
+
+def test_level_may_change_from_sample_to_sample():
+    state = begin_noise(1, "x", rate=RATE, terms="QNBK")
+    units, _ = draw(state, 0, 6000)
+    high = np.where(np.arange(6000) < 3000, 1.0, 9.0)
+    for term in "QNBK":
+        level = {other: 0.0 for other in "QNBK"} | {term: high}
+        plain, _ = shape(units, {other: 0.0 for other in "QNBK"} | {term: 1.0}, RATE, {})
+        raised, _ = shape(units, level, RATE, {})
+        np.testing.assert_allclose(raised[:2999], plain[:2999], rtol=0, atol=1e-9 * np.abs(plain).max())
+        if term == "K":  # increments, not the position, are three times as large
+            np.testing.assert_allclose(raised[3001:] - raised[3000], 3 * (plain[3001:] - plain[3000]), rtol=1e-9)
+        else:
+            np.testing.assert_allclose(raised[3001:], 3 * plain[3001:], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"N": -1.0}, "N=-1.0: give a number from 0 up"),
+        ({"rate": 0.0}, "rate=0.0: give a number above 0"),
+        ({"K": np.nan}, "K=nan"),
+        ({"B": 1.0, "flicker_band": (2.0, 1.0)}, "band of flicker noise 2 to 1 Hz is empty"),
+    ],
+)
+def test_wrong_numbers_are_named(wrong, words):
+    with pytest.raises(OptionError, match=words):
+        make_noise(**{"rate": RATE, "size": 10, **wrong})
