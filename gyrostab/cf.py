@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.clock import time_of_day
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.schema import check_log, check_product, check_surface
 from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
@@ -182,7 +182,7 @@ def _attributes_to_disk(attrs: dict[str, Any]) -> dict[str, Any]:
 
 
 def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, Any]:
-    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    now = time_of_day()
     try:
         version = metadata.version("gyrostab")
     except metadata.PackageNotFoundError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from gyrostab.clock import time_of_day
 from gyrostab.errors import OptionError, TimeError, UnitError
 from gyrostab.gaps import gap_variables, name_lost
 from gyrostab.join.channels import join_channels
@@ -150,7 +150,7 @@ def _attributes(sources: Sequence[Source], size: int, notes: Sequence[str]) -> d
     files = [[names] if isinstance(names := source.log.attrs.get("source_files", []), str) else list(names) for source in sources]
     said = [[note] if isinstance(note := source.log.attrs.get("notes", []), str) else list(note) for source in sources]
     labels = [names[0] if len(names) == 1 else source.name for names, source in zip(files, sources, strict=True)]
-    now = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
+    now = time_of_day()
     done = f"{now} gyrostab.read_log: {len(sources)} regular logs on {size} samples at {sources[0].rate:.10g} Hz"
     lost = [name for source in sources for name in source.log.attrs.get("unreadable_files", [])]
     return {

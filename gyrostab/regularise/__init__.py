@@ -6,13 +6,13 @@ No value is ever interpolated, averaged or moved by a fraction of a sample: a sa
 from __future__ import annotations
 
 import math
-from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
 import pandas as pd
 import xarray as xr
 
+from gyrostab.clock import time_of_day
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.gaps import gap_variables, name_lost
 from gyrostab.regularise.fill import gathered, on_grid
@@ -123,7 +123,7 @@ def _channels(raw: xr.Dataset, found: Survey, placement: Placement, rate: float,
 
 def _attributes(raw: xr.Dataset, kind: str, rate: float, done: str, notes: list[str]) -> dict[str, Any]:
     kept = {key: value for key, value in raw.attrs.items() if key not in _OWN_ATTRIBUTES}
-    now = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
+    now = time_of_day()
     history = "\n".join(filter(None, [raw.attrs.get("history"), f"{now} gyrostab.regularise: {done}"]))
     before = raw.attrs.get("notes", [])
     said = [*([before] if isinstance(before, str) else before), *notes]

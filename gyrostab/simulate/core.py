@@ -7,13 +7,13 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.clock import time_of_day
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.gaps import gap_variables
 from gyrostab.noise import TERMS
@@ -309,7 +309,7 @@ def _labelled(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.
     log = log.assign_coords(axis=("axis", list(frame.axes), attributes("axis")))
     if "time" not in log.coords:
         log = log.assign_coords(time_coordinate(frame.start, frame.rate, frame.size))
-    now = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
+    now = time_of_day()
     log.attrs = {
         "sampling_rate_hz": frame.rate,
         "kind": "rate",

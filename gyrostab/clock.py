@@ -1,0 +1,37 @@
+"""The time of day for histories: the clock's, or the one that a reproducible build asks for."""
+
+from __future__ import annotations
+
+import os
+from datetime import UTC, datetime
+
+from gyrostab.errors import OptionError
+
+__all__ = ["time_of_day"]
+
+
+def time_of_day() -> str:
+    """Time now, UTC, as ISO 8601; that of the environment variable ``SOURCE_DATE_EPOCH`` [s since 1970] where it is set.
+
+    With that variable, the same inputs, options and versions make the same file, byte for byte.
+
+    Raises
+    ------
+    OptionError
+        When the variable holds no whole number of seconds.
+
+    References
+    ----------
+    https://reproducible-builds.org/specs/source-date-epoch/
+
+    Examples
+    --------
+    >>> len(time_of_day())
+    20
+    """
+    given = os.environ.get("SOURCE_DATE_EPOCH")
+    try:
+        now = datetime.now(UTC) if not given else datetime.fromtimestamp(int(given), UTC)
+    except (ValueError, OverflowError, OSError) as error:
+        raise OptionError(f"SOURCE_DATE_EPOCH={given!r} in the environment is no whole number of seconds since 1970; unset it") from error
+    return f"{now:%Y-%m-%dT%H:%M:%SZ}"
