@@ -35,7 +35,8 @@ class Source:
         out = np.full((self.log.sizes["axis"], end - begin), np.nan)
         low, high = max(begin, 0), min(end, self.size)
         if low < high:
-            out[:, low - begin : high - begin] = self.log[signal_name(self.log)].data[:, low:high]
+            part = self.log[signal_name(self.log)].data[:, low:high]
+            out[:, low - begin : high - begin] = part if isinstance(part, np.ndarray) else part.compute(scheduler="synchronous")
         return out
 
 
