@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.cf import from_disk, to_disk
+from gyrostab.cf import from_disk, index_dim, to_disk
 from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.output import new_output
 from gyrostab.schema import check_log, check_product, check_surface
@@ -109,7 +109,7 @@ def _filters(compression: str | None, *, log: bool) -> dict[str, Any]:
     if chosen == "zstd":
         with netCDF4.Dataset("probe", "w", diskless=True, persist=False) as probe:
             if probe.has_zstd_filter():
-                return {"compression": "zstd", "complevel": 3, "shuffle": True, "fletcher32": True}
+                return {"compression": "zstd", "complevel": 3, "fletcher32": True}
         warnings.warn(f"netCDF library {netCDF4.__netcdf4libversion__} has no zstd here: the log is compressed with zlib", stacklevel=3)
     return {"zlib": True, "complevel": 4, "shuffle": True}
 
@@ -206,7 +206,9 @@ def _is_data(dataset: xr.Dataset, name: Any) -> bool:
 def _chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
     """One axis (and one term) a chunk, every tau, and as much time as fits; of a log 20 minutes."""
     inner = int(np.prod([size for dim, size in variable.sizes.items() if dim not in ("axis", "term", variable.dims[-1])]))
-    most = max(1, _CHUNK // max(1, inner)) if rate is None else chunk_samples(rate)
+    most = max(1, _CHUNK // max(1, inner))
+    if rate is not None:
+        most = chunk_samples(rate if variable.dims[-1] in ("time", index_dim("time")) else 0.0)
     last = max(1, min(variable.shape[-1], most))
     return tuple(last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size for dim, size in variable.sizes.items())
 

@@ -11,7 +11,7 @@ __all__ = ["from_counts", "to_counts"]
 
 
 def to_counts(values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill: int) -> NDArray[np.integer[Any]] | None:
-    """Integers of which ``from_counts`` makes the very same values; None when there are none.
+    """Integers of which ``from_counts`` makes the very same values (of a zero, without its sign); None when there are none.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def to_counts(values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill:
         if not ((whole >= limits.min) & (whole <= limits.max)).all():
             return None
     counts = whole.astype(dtype)
-    same = (counts * np.float64(scale)).view(np.int64) == np.ascontiguousarray(values, dtype=np.float64).view(np.int64)
+    same = counts * np.float64(scale) == values
     same &= counts != fill
     same |= missing
     return counts if same.all() else None

@@ -231,7 +231,7 @@ class _Chunks:
         except (OSError, RuntimeError, ValueError) as error:
             if isinstance(error, OSError) and error.errno not in (None, errno.EIO):
                 raise FormatError(f"{folder / name}: cannot be read ({error.strerror})") from error
-            raise _Damage(f"is damaged: {self.name}/{name}: {error}") from error
+            raise _Damage(f"is damaged: {self.name}/{name}: {' '.join(str(error).split())}") from error
         if whole.size != self.length:
             raise _Damage(f"is damaged: {self.name}/{name} holds {whole.size} values in place of {self.length}")
         return whole[begin - number * self.length : stop - number * self.length]
@@ -260,7 +260,7 @@ def _zarr_layout(folder: Path, opened: str) -> tuple[list[Any], np.dtype[Any], s
     try:
         layout = json.loads((folder / ".zarray").read_text())
     except OSError as error:
-        raise FormatError(f"{folder}: cannot be read any more ({error.strerror}); has it been moved or removed?") from error
+        raise FormatError(f"{folder}: is not there any more ({error.strerror}); has it been moved or removed?") from error
     codecs = [numcodecs.get_codec(item) for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item]
     return codecs, np.dtype(layout["dtype"]), layout.get("dimension_separator", ".")
 

@@ -30,7 +30,7 @@ class Misfit(ValueError):
 
 
 def chunk_samples(rate: float) -> int:
-    """Samples in one chunk of a log of `rate` [Hz]: 20 minutes, but neither very few nor very many.
+    """Samples in one chunk of a log of `rate` [Hz]: 20 minutes, but neither very few nor very many; 0 stands for slow.
 
     Examples
     --------
