@@ -196,10 +196,9 @@ def _lose(plan: Plan, rate: Array, first: int, missing: NDArray[np.bool_] | None
 
 
 def check_effects(steps: Sequence[Step]) -> list[Step]:
-    """Parameters with one number for each axis fit the axes of the log."""
+    """Parameters with one number for each axis fit the axes of the log, or `OptionError`."""
     for step in steps:
         for item in step.effect.parameters():
-            if item.many and len(getattr(step.effect, item.name)) != len(step.rows):
-                axes = ", ".join(step.setup.axes)
-                raise OptionError(f"effect {step.effect.name!r}, parameter {item.name!r}: give one number for each of the axes {axes}")
+            if item.many and getattr(step.effect, item.name):
+                step.effect.each(item.name, step.setup.axes)
     return list(steps)

@@ -47,6 +47,8 @@ class Source:
         Grid of a long channel: first stamp [ns since 1970], samples in a second [Hz].
     first : float
         First value that is a number.
+    size : int
+        Number of its values.
     """
 
     name: str
@@ -57,13 +59,14 @@ class Source:
     start: int = 0
     rate: float = 1.0
     first: float = np.nan
+    size: int = 0
 
     def stretch(self, before: int, end: int) -> Stretch | None:
         """Which values the instants after `before` up to `end` [ns] need; None for a channel that is in memory."""
         if self.stamps is not None:
             return None
         first, last = np.floor(grid_index(self.start, self.rate, [before, end])).astype(int).tolist()
-        size = self.values.size
+        size = self.size
         return Stretch(min(max(first, 0), size - 1), min(max(last + 2, 1), size))
 
     def at(self, instants: NDArray[np.int64], part: tuple[Stretch, Any] | None, carry: float | None) -> tuple[Array, float | None]:
@@ -89,11 +92,15 @@ class Source:
         stretch, values = part
         known = np.asarray(values, dtype=np.float64)
         whole = _filled(np.concatenate([[self.first if carry is None else carry], known]))
-        position = np.clip(grid_index(self.start, self.rate, instants) - stretch.low + 1, 0 if stretch.low else 1, known.size)
+        position = grid_index(self.start, self.rate, instants)
         position = np.where(np.abs(position - np.rint(position)) < 1e-6, np.rint(position), position)
+        position = np.clip(position, 0, self.size - 1)
         base = np.floor(position).astype(np.int64)
-        after = whole[base] if self.held else np.interp(position, np.arange(whole.size), whole)
-        return after, float(whole[base[-1]])
+        place = base - stretch.low + 1
+        after = whole[place]
+        if not self.held:  # from the number of the sample itself, so that the last bit is the same in every stretch
+            after = after + (position - base) * (whole[np.minimum(place + 1, known.size)] - after)
+        return after, float(whole[place[-1]])
 
     def _between(self, instants: NDArray[np.int64]) -> Array:
         stamps = self.stamps
@@ -144,7 +151,7 @@ def make_source(log: xr.Dataset, name: str) -> Source:
     held = variable.attrs.get("interpolation") == "previous"
     index = log.xindexes.get(dim)
     if data.size > SHORT and isinstance(index, TimeGridIndex):
-        return Source(name, units, held, None, data, start=index.start, rate=index.rate, first=_first_number(data, name))
+        return Source(name, units, held, None, data, start=index.start, rate=index.rate, first=_first_number(data, name), size=data.size)
     values = np.asarray(data, dtype=np.float64)
     good = ~np.isnan(values)
     if not good.any():
