@@ -1,8 +1,8 @@
-"""Gaussian processes of continuous time with a resonance or a band, read at the samples or averaged over each sample, without approximation.
+"""Gaussian processes of continuous time, a resonance or a band, read at the samples or averaged over them, without approximation.
 
 A process is white noise behind second-order sections in series. Its state is known from one sample to the next by the matrix
-exponential, and so are the joint distribution of the state and of the mean over the interval between (Van Loan 1978). So a process far above half of
-the sampling rate folds down as it does in a logger that samples it, and needs no finer time.
+exponential, and so are the joint distribution of the state and of the mean over the interval between (Van Loan 1978). So a process far
+above half of the sampling rate folds down as it does in a logger that samples it, and needs no finer time.
 
 References
 ----------
@@ -69,7 +69,7 @@ def _factor(covariance: Array) -> Array:
     """A lower triangle whose square is the covariance, which may be singular."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.ascontiguousarray(np.linalg.qr(root.T, mode="r").T)
+    return np.ascontiguousarray(np.asarray(np.linalg.qr(root.T, mode="r")).T)
 
 
 def _reading(a: Array, covariance: Array, c: Array, rate: float, *, average: bool) -> Reading:

@@ -24,16 +24,17 @@ class SpectralLine(Effect):
     the same mean square ``A^2 / 2``, with the density ``(A^2 / 2) w f^2 / (pi ((f^2 - f0^2)^2 + w^2 f^2))`` and w = f0 / Q. Every sample is
     the mean over its interval, so a line above half of the sampling rate folds down with the factor sinc(f / fs).
 
-    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``: a bump of 0.724 A^2 in the variance at tau = 0.371 / f, then combs that fall with 1 / tau in
-    sigma; a resonance has the bump without the combs. *Window mean*: nothing. *Spectrum*: a line, or a peak of width f0 / Q.
-    *Axes*: one motion, with a factor for each axis.
+    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``: a bump of sigma = 0.725 A at tau = 0.371 / f, then a comb that falls with 1 / tau;
+    a resonance has the bump without the comb. *Window mean*: nothing. *Spectrum*: a line, or a peak of width f0 / Q. *Axes*: one
+    motion, with a factor for each axis.
 
     Confused with rotation_line and earth_rate (move with the rotation), feedback_reset (moves with the gyro's own rate) and
     aliased_vibration (moves with the sampling rate, follows vibration): see whether f moves with rotation, temperature, sampling rate.
 
     References
     ----------
-    IEEE Std 952-1997, annex C (Allan variance of a sinusoid). Sizes are estimates: structures resonate at 20 to 2000 Hz with a quality of 5 to 50.
+    IEEE Std 952-1997, annex C (Allan variance of a sinusoid). Sizes are estimates: structures resonate at 20 to 2000 Hz with a quality
+    of 5 to 50.
 
     Examples
     --------
@@ -67,9 +68,9 @@ class SpectralLine(Effect):
         amplitude = self.each("amplitude", chunk.setup.axes)[:, None]
         if state is None:
             cycles = self.frequency / chunk.rate
-            middle = (chunk.first + np.arange(chunk.size) + 0.5) * cycles
+            middle: Array = (np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5) * cycles
             phase = np.radians(self.each("phase", chunk.setup.axes))[:, None] - math.pi / 2.0
-            return amplitude * turn_means(middle, np.asarray(cycles), phase), None
+            return np.asarray(amplitude * turn_means(middle, np.full(1, cycles), phase)), None
         from gyrostab.kernels.coloured import march
 
         reading, rng, position = state
@@ -110,15 +111,15 @@ class RotationLine(Effect):
     """Lines locked to the rotation of the tool, or with another driver to the strokes of a pump or the modes of stick-slip.
 
     ``rate(t) = sum_k A k^-p cos(k (m theta(t) + phi))`` over k = 1 to `harmonics`, theta the turns of the channel since the start of
-    the log, m the `order`: lines in a turn. The phase is the integral of the channel, carried on from sample to sample, and each sample is the
-    mean over its interval, so a line folds where its frequency passes half of the sampling rate.
+    the log, m the `order`: lines in a turn. The phase is the integral of the channel, carried on from sample to sample, and each sample
+    is the mean over its interval, so a line folds where its frequency passes half of the sampling rate.
 
-    *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f wanders inside a window; it moves to shorter times as the tool speeds up.
-    *Window mean*: nothing while it turns; ``A cos(phi)`` of the standing tool. *Spectrum*: a comb that follows the rotation.
+    *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f wanders inside a window; it moves to shorter times as the tool
+    speeds up. *Window mean*: nothing while it turns; ``A cos(phi)`` of the standing tool. *Spectrum*: a comb that follows the rotation.
     *Axes*: phase locked, with amplitude and phase of each axis.
 
-    Confused with earth_rate (15 deg/h at most, quadrature between the cross axes), g_sensitivity and magnetic (proportional to their channels),
-    and spectral_line (does not move): see whether the line moves with the rotation, and with which multiple.
+    Confused with earth_rate (15 deg/h at most, quadrature between the cross axes), g_sensitivity and magnetic (proportional to their
+    channels), and spectral_line (does not move): see whether the line moves with the rotation, and with which multiple.
 
     References
     ----------
@@ -140,7 +141,7 @@ class RotationLine(Effect):
     order: float = parameter("1", "frequency of the first line [per turn]", default=1.0, low=1e-3, high=1e3)
     harmonics: float = parameter("1", "number of lines", default=1.0, low=1.0, high=100.0)
     rolloff: float = parameter("1", "the k-th line is k^-rolloff of the first", default=1.0, low=-5.0, high=5.0)
-    phase: tuple[float, ...] = parameter("deg", "phase of the first line at the start of the log", default=(), low=-1e6, high=1e6, many=True)
+    phase: tuple[float, ...] = parameter("deg", "phase of the first line at the start", default=(), low=-1e6, high=1e6, many=True)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Turns of the channel so far."""

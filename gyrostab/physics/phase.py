@@ -53,7 +53,7 @@ def turn_means(middle: Array, inside: Array, phase: Array | float = 0.0) -> Arra
 
 
 def turns_of_windows(windows: Windows, rotation: Array) -> tuple[Array, Array]:
-    """Turns at the middle of every window, counted from the start of the log, and inside of it, from its mean rotation rate [degree s-1]."""
+    """Turns from the start of the log to the middle of every window, and inside of it, from its mean rotation rate [degree s-1]."""
     rate, centre = rotation / TURN, windows.centre
     between = (rate[1:] + rate[:-1]) / 2.0 * np.diff(centre)
     return np.cumsum(np.concatenate([rate[:1] * centre[:1], between])), rate * (windows.end - windows.begin)

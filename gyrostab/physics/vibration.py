@@ -137,17 +137,17 @@ class AliasedVibration(Effect):
 
     ``rate(t) = s g(t) v(t)``: v is noise of unit power between `low` and `high` (Butterworth, half power at both), behind a mount of
     stated resonance, if any; g is the rms of the vibration. A sample is v at its beginning (``"point"``) or the mean of v over its
-    interval (``"average"``, integrate and dump). So the samples have the density ``sum_k S(f + k fs) |H(f + k fs)|^2`` with H = 1 or sinc(f / fs),
-    because they are drawn from the process in continuous time, not because it is put in. Where the model makes the instrument sample faster than the
-    log, this is about the instrument, and the logger's own filter decides the rest.
+    interval (``"average"``, integrate and dump). So the samples have the density ``sum_k S(f + k fs) |H(f + k fs)|^2`` with H = 1 or
+    sinc(f / fs), because they are drawn from the process in continuous time, not because it is put in. Where the model makes the
+    instrument sample faster than the log, this is about the instrument, and the logger's own filter decides the rest.
 
     *DAVAR*: point samples raise sigma at all averaging times, like N, where the band folds onto zero frequency (P16's 700 to 800 Hz
     at 400 Hz fills 0 to 100 Hz: 8 times at 2.5 ms, 19 times from 40 ms on with 50 deg/h and N = 0.003); integrate and dump has its
     zeros there and raises short times only, like Q (1.3, 1.4, 1.1 times at 2.5, 10, 40 ms). *Window mean*: nothing, and no bias.
     *Spectrum*: the folded band. *Axes*: one rigid motion, with a factor for each axis.
 
-    Confused with vibration_noise (flat, no cross-spectrum), with Q (not tied to vibration) and spikes (heavy tails). What separates them is the
-    edge of the folded band, coherence of the axes, and another sampling rate, at which the band folds elsewhere.
+    Confused with vibration_noise (flat, no cross-spectrum), with Q (not tied to vibration) and spikes (heavy tails). What separates
+    them is the edge of the folded band, coherence of the axes, and another sampling rate, at which the band folds elsewhere.
 
     References
     ----------
@@ -177,7 +177,9 @@ class AliasedVibration(Effect):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.low < self.high:
-            raise OptionError(f"effect {self.name!r}: the band from low = {self.low:g} to high = {self.high:g} Hz is empty; low must be below high")
+            raise OptionError(
+                f"effect {self.name!r}: the band from low = {self.low:g} to high = {self.high:g} Hz is empty; low must be below high"
+            )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """The process at rest in its stationary state."""
@@ -223,12 +225,12 @@ class Magnetic(_Vector):
 
     ``b = m_x B_x + m_y B_y + m_z B_z`` for each axis that it acts on, B in the frame of the tool.
 
-    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps where the tool turns or passes casing.
-    *Window mean*: follows the field. *Spectrum*: a line at the frequency of rotation, with the phase of the field. *Axes*: every axis follows
+    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps where the tool turns or passes casing. *Window
+    mean*: follows the field. *Spectrum*: a line at the frequency of rotation, with the phase of the field. *Axes*: every axis follows
     the same field with factors of its own.
 
-    Confused with earth_rate (known amplitude, quadrature between the cross axes) and g_sensitivity (phase of gravity): the angle between field and gravity
-    in the tool separates them, best at two places with different fields.
+    Confused with earth_rate (known amplitude, quadrature between the cross axes) and g_sensitivity (phase of gravity): the angle
+    between field and gravity in the tool separates them, best at two places with different fields.
 
     References
     ----------

@@ -1,0 +1,366 @@
+"""Effects of rotation: errors in proportion to it, and rotation that is real."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.phase import TURN, fold, turn_means, turns_of_samples, turns_of_windows
+from gyrostab.units import INNER
+
+__all__ = ["EarthRate", "Misalignment", "RealMotion", "ScaleFactor"]
+
+_HOUR = 3600.0
+_PPM = 1e-6
+_MRAD = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleFactor(Effect):
+    """Error that is a function of the rotation rate w about the axis.
+
+    ``e = (S + S_T (T - T0)) w + A |w| + C w^3``
+
+    *DAVAR*: a copy of what w does: ramps give R, steps a K, stick-slip a bump; nothing while w stands. *Window mean*: follows w.
+    *Spectrum*: that of w. *Axes*: the axis of rotation only; 100 ppm of 180 r/min are 389 deg/h.
+
+    Confused with misalignment (seen on the other axes, in proportion to a foreign rate), and clock_error (the same on all axes): the
+    error turns its sign with w, but for the asymmetry, and the rotation must be known by other means than the gyro (magnetometer,
+    accelerometers).
+
+    References
+    ----------
+    IEEE Std 952-1997 (scale factor errors); He et al. 2015, OECC (the temperature of the scale factor leads the error of a gyro survey).
+    Sizes are estimates: 10 to 100 ppm for a good gyro, 100 to 1000 ppm for a simple one.
+
+    Examples
+    --------
+    >>> ScaleFactor(linear=100, axes=["z"]).say()
+    'The scale factor is wrong on axis z, linear 100 ppm.'
+    """
+
+    name: ClassVar[str] = "scale_factor"
+    short: ClassVar[str] = "error proportional to (a function of) rotation rate"
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"], "temperature": INNER["temperature"]}
+    size_parameters: ClassVar[tuple[str, ...]] = ("linear", "asymmetry", "cubic", "thermal")
+    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997", "He et al. 2015, OECC")
+
+    linear: float = parameter("ppm", "error of the scale factor", default=0.0, typical=50.0, low=-1e6, high=1e6)
+    asymmetry: float = parameter("ppm", "the same sign for both directions", default=0.0, typical=10.0, low=-1e6, high=1e6)
+    cubic: float = parameter("ppm/(deg/s)^2", "growth with the square of the rate", default=0.0, typical=1e-5, low=-1.0, high=1.0)
+    thermal: float = parameter("ppm/degC", "growth with the temperature", default=0.0, typical=1.0, low=-1e4, high=1e4)
+    reference: float = parameter("degC", "temperature of the calibration", default=25.0, low=-273.15, high=500.0)
+    rotation: str = parameter(
+        "text", "rotation about the axis: the channel, or the true rate of the model", default="channel", choices=("channel", "true")
+    )
+
+    def needs(self) -> tuple[str, ...]:
+        """The rotation rate unless the true rate is taken, and the temperature if it matters."""
+        return ("rotation_rate",) * (self.rotation == "channel") + ("temperature",) * bool(self.thermal)
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        if self.rotation == "channel":
+            rate = chunk.drivers["rotation_rate"] * _HOUR
+        else:
+            rate = np.stack([chunk.true[axis] for axis in chunk.setup.axes])
+        error = self.linear * rate + self.asymmetry * np.abs(rate) + self.cubic * rate * (rate / _HOUR) ** 2
+        if self.thermal:
+            error = error + self.thermal * (chunk.drivers["temperature"] - self.reference) * rate
+        return error * _PPM, state
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means: functions of the mean rotation rate, which is all of the mean but for asymmetry and cubic while it wanders."""
+        if self.rotation == "channel":
+            rate = windows.drivers["rotation_rate"] * _HOUR
+        else:
+            rate = np.stack([windows.own[axis] for axis in windows.axes])
+        mean = {"linear": rate, "asymmetry": np.abs(rate), "cubic": rate * (rate / _HOUR) ** 2}
+        if "temperature" in windows.drivers:
+            mean["thermal"] = rate * (windows.drivers["temperature"] - self.reference)
+        return Prediction(mean={name: _PPM * design for name, design in mean.items()})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        terms = [f"{name} {self.quantity(name, errors)}" for name in self.size_parameters if getattr(self, name)]
+        return f"The scale factor is wrong {self.on_axes()}, {', '.join(terms) or 'by nothing'}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misalignment(Effect):
+    """The true rate of other axes leaks in.
+
+    ``e = m_x w_x + m_y w_y + m_z w_z``, without the axis's own rate, w the true rates of the log's axes named x, y and z. What moves
+    them stands in the same model: real_motion, earth_rate.
+
+    *DAVAR*: a copy of the other axis's motion, scaled: 1 mrad of 180 r/min is 3900 deg/h. *Window mean*: follows the other axis.
+    *Spectrum*: lines and motion of the other axis only. *Axes*: coherent with the other gyro where there is true motion, not elsewhere.
+
+    Confused with scale_factor (own axis only), shared_source (broadband coherence also at rest) and real_motion (accelerometers see it):
+    the coherence has to vanish while the tool stands, and the factor to be the same at all rates.
+
+    References
+    ----------
+    IEEE Std 952-1997 (input axis misalignment). Sizes are estimates: 0.1 to 1 mrad.
+
+    Examples
+    --------
+    >>> Misalignment(z=0.5, axes=["x"]).say()
+    'The rotation of other axes leaks in on axis x, by 0.5 mrad of z.'
+    """
+
+    name: ClassVar[str] = "misalignment"
+    short: ClassVar[str] = "another axis's rate leaks in"
+    stage: ClassVar[Stage] = "rate"
+    size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
+
+    x: float = parameter("mrad", "lean towards axis x", default=0.0, typical=0.5, low=-1e3, high=1e3)
+    y: float = parameter("mrad", "lean towards axis y", default=0.0, typical=0.5, low=-1e3, high=1e3)
+    z: float = parameter("mrad", "lean towards axis z", default=0.0, typical=0.5, low=-1e3, high=1e3)
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        error = np.zeros(chunk.shape)
+        for source in self.size_parameters:
+            size = getattr(self, source)
+            if not size:
+                continue
+            if source not in chunk.true:
+                raise SchemaError(
+                    f"effect {self.name!r} needs the rate of axis {source!r}, which the log does not have; it has "
+                    f"{', '.join(chunk.true)}; set {source} = 0 or name the axes x, y, z"
+                )
+            for row, axis in enumerate(chunk.setup.axes):
+                if axis != source:
+                    error[row] += size * _MRAD * chunk.true[source]
+        return error, state
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means: the measured rates of the other axes."""
+        mean = {}
+        for source in self.size_parameters:
+            if source in windows.own and any(axis != source for axis in windows.axes):
+                mean[source] = np.stack([_MRAD * windows.own[source] * (axis != source) for axis in windows.axes])
+        return Prediction(mean=mean)
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        terms = [f"{self.quantity(name, errors)} of {name}" for name in self.size_parameters if getattr(self, name)]
+        return f"The rotation of other axes leaks in {self.on_axes()}, by {', '.join(terms) or 'nothing'}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class EarthRate(Effect):
+    """The rotation of the earth, seen by a tool that rotates about its own axis.
+
+    With inclination I from straight down, azimuth A and latitude L, the tool sees ``W_d = W (cos L sin I cos A - sin L cos I)`` along
+    its axis, ``W_h = W (cos L cos I cos A + sin L sin I)`` towards the high side and ``W_r = -W cos L sin A`` to the right of it. An
+    axis that stands at `off` degrees from the tool's axis, and `around` it at the angle a from x towards y, sees ``cos(off) W_d +
+    sin(off) (W_h cos(F + a) + W_r sin(F + a))``, with the toolface F = F0 + integral of the rotation rate, clockwise looking down the
+    hole. Axes named x, y, z (or ending so) stand at 90, 90, 0 degrees off and 0, 90, 0 around. Each sample is the mean over its
+    interval.
+
+    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``, a bump of sigma at tau = 0.371 / f with A of at most 15.04 deg/h, smeared where f
+    wanders; nothing while the tool stands. *Window mean*: the constant part along the tool; steps between toolfaces where it stands.
+    *Spectrum*: a line at the frequency of rotation. *Axes*: quadrature between x and y, equal in size; none on z.
+
+    Confused with g_sensitivity and magnetic (free amplitude, phase of gravity or field), and rotation_line: here amplitude and phase
+    follow from latitude, inclination and azimuth.
+
+    References
+    ----------
+    IEEE Std 952-1997, annex C (Allan variance of a sinusoid); 15.041067 deg/h is the earth's rotation against the stars.
+
+    Examples
+    --------
+    >>> EarthRate(latitude=60).say()
+    'The earth turns with 15.04 deg/h; the tool at latitude 60 deg sees 7.521 deg/h across and -13.03 deg/h along itself, on all axes.'
+    """
+
+    name: ClassVar[str] = "earth_rate"
+    short: ClassVar[str] = "earth rate modulated by tool rotation"
+    stage: ClassVar[Stage] = "motion"
+    channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
+    size_parameters: ClassVar[tuple[str, ...]] = ("rate",)
+    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
+
+    latitude: float = parameter("deg", "latitude, north positive", typical=45.0, low=-90.0, high=90.0)
+    inclination: float = parameter("deg", "angle of the tool from straight down", default=0.0, typical=30.0, low=0.0, high=180.0)
+    azimuth: float = parameter("deg", "direction of the tool, clockwise from north", default=0.0, typical=60.0, low=-360.0, high=360.0)
+    toolface: float = parameter("deg", "angle of x from the high side at the start", default=0.0, low=-360.0, high=360.0)
+    off: tuple[float, ...] = parameter("deg", "angle of each axis from the tool's", default=(), low=0.0, high=180.0, many=True)
+    around: tuple[float, ...] = parameter("deg", "angle of each axis around the tool", default=(), low=-360.0, high=360.0, many=True)
+    rate: float = parameter("deg/h", "rotation of the earth", default=15.041067, low=0.0, high=20.0, source="sidereal day of 86164.1 s")
+
+    def components(self) -> tuple[float, float, float]:
+        """Rate along the tool, towards its high side and to the right of it [degree hour-1]."""
+        lat, inc, azi = (math.radians(angle) for angle in (self.latitude, self.inclination, self.azimuth))
+        north, down = self.rate * math.cos(lat), -self.rate * math.sin(lat)
+        along = north * math.sin(inc) * math.cos(azi) + down * math.cos(inc)
+        high = north * math.cos(inc) * math.cos(azi) - down * math.sin(inc)
+        return along, high, -north * math.sin(azi)
+
+    def _directions(self, axes: tuple[str, ...]) -> tuple[Array, Array]:
+        """Angles of the axes from the tool's axis and around it [radian]."""
+        if self.off or self.around:
+            return np.radians(self.each("off", axes)), np.radians(self.each("around", axes))
+        known = {"x": (90.0, 0.0), "y": (90.0, 90.0), "z": (0.0, 0.0)}
+        for axis in axes:
+            if axis[-1:].lower() not in known:
+                raise OptionError(f"effect {self.name!r}: axis {axis!r} is not x, y or z; say where it looks with off and around [deg]")
+        off, around = np.radians(np.array([known[axis[-1].lower()] for axis in axes])).T
+        return off, around
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """Turns of the tool so far."""
+        self._directions(setup.axes)
+        return 0.0
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """True rate [degree hour-1] on every sample."""
+        middle, inside, state = turns_of_samples(chunk.drivers["rotation_rate"], chunk.rate, state)
+        return self._seen(middle, inside, chunk.setup.axes), state
+
+    def _seen(self, middle: Array, inside: Array, axes: tuple[str, ...]) -> Array:
+        """Mean over intervals of what the axes see."""
+        along, high, right = self.components()
+        off, around = self._directions(axes)
+        phase = math.radians(self.toolface) + around - math.atan2(right, high)
+        across = math.hypot(high, right) * np.sin(off)
+        return np.asarray(along * np.cos(off)[:, None] + across[:, None] * turn_means(middle, inside, phase[:, None]))
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """The toolface at the start; the rest is known to a survey."""
+        return {"toolface": np.arange(0.0, 360.0, 30.0)}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means, and where the line shows."""
+        rotation = windows.drivers["rotation_rate"]
+        seen = self._seen(*turns_of_windows(windows, rotation), windows.axes)
+        return Prediction(mean={"rate": seen / self.rate if self.rate else 0.0 * seen}, line=fold(np.abs(rotation) / TURN, windows.rate))
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        along, high, right = self.components()
+        across = math.hypot(high, right)
+        seen = f"sees {across:.4g} deg/h across and {along:.4g} deg/h along itself, {self.on_axes()}"
+        return f"The earth turns with {self.quantity('rate', errors)}; the tool at latitude {self.quantity('latitude')} {seen}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealMotion(Effect):
+    """Rotation that is no error: sway, the turning of the tool, and tilt of the mounting under acceleration.
+
+    ``w_a = d_a (sway(t) + spin w(t) + d/dt (c_x a_x + c_y a_y + c_z a_z))``: d_a is the share of each axis (a direction); sway is the
+    velocity of an oscillator of stated frequency and quality shaken by white noise; w the rotation rate; c the tilt per acceleration,
+    whose change in a sample is the rotation in it. What comes first in the model comes first in `true`, which misalignment,
+    scale_factor and dead zone see.
+
+    *DAVAR*: bump of the sway at 0.371 / f without a floor at long times; the turning as it is. *Window mean*: the turning; sway and
+    tilt leave nothing, because the angle stays bounded. *Spectrum*: a peak of width f / Q; tilt has f^2 times that of the
+    accelerations. *Axes*: one motion in one direction: coherence of one, with the signs of the direction.
+
+    Confused with vibration_rectification and vibration_noise (not coherent over the axes as one rotation) and shared_source (broadband,
+    also at rest): accelerometers and the fixed direction in space tell.
+
+    References
+    ----------
+    Optik, linear vibration and three-axis FOGs in MWD (angular vibration from linear vibration by the mounting). Sizes are estimates:
+    0.01 deg of sway at 0.5 Hz are 113 deg/h.
+
+    Examples
+    --------
+    >>> RealMotion(sway=10, direction=[0.6, 0.8, 0.0], axes=["x", "y", "z"]).say()
+    'The tool really rotates on axes x, y and z, with shares 0.6, 0.8, 0: sway 10 deg/h at 0.3 Hz.'
+    """
+
+    name: ClassVar[str] = "real_motion"
+    short: ClassVar[str] = "rotation that is not an error"
+    stage: ClassVar[Stage] = "motion"
+    channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]} | dict.fromkeys(
+        ("accel_x", "accel_y", "accel_z"), INNER["acceleration"]
+    )
+    size_parameters: ClassVar[tuple[str, ...]] = ("sway", "spin", "x", "y", "z")
+    references: ClassVar[tuple[str, ...]] = ("Optik, linear vibration and three-axis FOGs in MWD",)
+
+    direction: tuple[float, ...] = parameter("1", "share of each axis", default=(1.0,), low=-1.0, high=1.0, many=True)
+    sway: float = parameter("deg/h", "rms rate of the sway", default=0.0, typical=10.0, low=0.0, high=1e7)
+    frequency: float = parameter("Hz", "frequency of the sway", default=0.3, low=1e-4, high=1e4)
+    quality: float = parameter("1", "frequency of the sway over its width", default=20.0, low=0.5, high=1e4)
+    spin: float = parameter("1", "share of the rotation rate", default=0.0, typical=1.0, low=-1.0, high=1.0)
+    x: float = parameter("mrad/g", "tilt of the mounting per acceleration along x", default=0.0, typical=0.01, low=-100.0, high=100.0)
+    y: float = parameter("mrad/g", "tilt of the mounting per acceleration along y", default=0.0, typical=0.01, low=-100.0, high=100.0)
+    z: float = parameter("mrad/g", "tilt of the mounting per acceleration along z", default=0.0, typical=0.01, low=-100.0, high=100.0)
+
+    def needs(self) -> tuple[str, ...]:
+        """The rotation rate if there is spin, and the accelerations that tilt it."""
+        return ("rotation_rate",) * bool(self.spin) + tuple(f"accel_{name}" for name in "xyz" if getattr(self, name))
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """The oscillator in its stationary state; no tilt yet."""
+        from gyrostab.kernels.coloured import oscillator, rest
+
+        reading = oscillator(self.frequency, self.quality, setup.rate)
+        return reading, rng, rest(reading, rng.standard_normal(2)), None
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """True rate [degree hour-1] on every sample."""
+        from gyrostab.kernels.coloured import march
+
+        reading, rng, position, tilt = state
+        motion, position = march(reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position)
+        motion = self.sway * motion
+        if self.spin:
+            motion += self.spin * _HOUR * chunk.drivers["rotation_rate"]
+        bent = [name for name in "xyz" if getattr(self, name)]
+        if bent:
+            angle = sum((self._bend(name) * chunk.drivers[f"accel_{name}"] for name in bent), np.zeros(chunk.size))
+            motion += np.diff(angle, prepend=angle[0] if tilt is None else tilt) * (chunk.rate * _HOUR)
+            tilt = float(angle[-1])
+        return self.each("direction", chunk.setup.axes)[:, None] * motion, (reading, rng, position, tilt)
+
+    def _bend(self, name: str) -> float:
+        """Tilt per acceleration [degree g-1]."""
+        return math.degrees(getattr(self, name) * _MRAD)
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """Where the sway is, and how sharp."""
+        return {"frequency": windows.frequency, "quality": np.array([5.0, 20.0, 80.0])}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means: turning and tilt; and the spectrum of the sway, the same process on all axes."""
+        from gyrostab.kernels.coloured import folded_psd, oscillator_psd
+
+        direction = self.each("direction", windows.axes)[:, None]
+        mean = {}
+        if "rotation_rate" in windows.drivers:
+            mean["spin"] = direction * _HOUR * windows.drivers["rotation_rate"]
+        for name in "xyz":
+            if f"accel_{name}" in windows.drivers and windows.begin.size > 1:
+                slope = np.gradient(windows.drivers[f"accel_{name}"], windows.centre)
+                mean[name] = direction * (math.degrees(_MRAD) * _HOUR * slope)
+
+        def density(f: Array) -> Array:
+            return oscillator_psd(f, self.frequency, self.quality)
+
+        highest = self.frequency * (1.0 + 20.0 / self.quality)
+        folded = folded_psd(density, windows.frequency, windows.rate, highest, average=True)
+        return Prediction(mean=mean, spectrum={"sway": np.broadcast_to(folded, (windows.begin.size, folded.size))}, coherent=True)
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        terms = []
+        if self.sway:
+            terms.append(f"sway {self.quantity('sway', errors)} at {self.quantity('frequency', errors)}")
+        if self.spin:
+            terms.append(f"{self.quantity('spin', errors)} of {self.channel_names()['rotation_rate']}")
+        terms += [f"tilt {self.quantity(name, errors)} along {name}" for name in "xyz" if getattr(self, name)]
+        return f"The tool really rotates {self.on_axes()}, with shares {self.quantity('direction')}: {', '.join(terms) or 'not at all'}."
