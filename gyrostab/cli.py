@@ -88,8 +88,18 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
 
 
 @app.command(sort_key=2, help_epilogue="")
-def ingest(logs: Logs, /, *, output: Output, reading: Reading = Reading(), common: Common = Common()) -> None:
+def ingest(
+    logs: Logs,
+    /,
+    *,
+    output: Output,
+    compression: Literal["zstd", "zlib"] | None = None,
+    reading: Reading = Reading(),
+    common: Common = Common(),
+) -> None:
     """Put logs on one uniform time axis, with the gaps marked, and write them as NetCDF or Zarr.
+
+    Integer counts stay integers. The logs may be larger than the memory.
 
     Example: gyrostab ingest run7/*.csv -o run7.nc
 
@@ -99,17 +109,29 @@ def ingest(logs: Logs, /, *, output: Output, reading: Reading = Reading(), commo
         One or more logs, in any order.
     output
         File to write, LOG.nc or LOG.zarr.
+    compression
+        Of a NetCDF file: zstd is fast, zlib is read by programs that lack zstd, such as Octave and R on many systems (default: zstd).
     """
     from gyrostab.export import to_netcdf, to_zarr
     from gyrostab.run import check_output, load_log, samples_of
 
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite, inputs=logs)
+    zarr = target.suffix.lower() == ".zarr"
+    if zarr and compression:
+        raise OptionError(f"--compression {compression} is for NetCDF, and {output} is Zarr; leave it out")
     with _work(common) as stage:
         stage("reading", 0)
         log = load_log(logs, **reading.options())
-        stage("writing", samples_of(log))
-        write = to_zarr if target.suffix == ".zarr" else to_netcdf
-        write(log, target, overwrite=common.overwrite)
+        samples = samples_of(log)
+        stage("writing", samples)
+
+        def tell(share: float) -> None:
+            stage("writing", samples, round(share * samples))
+
+        if zarr:
+            to_zarr(log, target, overwrite=common.overwrite, progress=tell)
+        else:
+            to_netcdf(log, target, overwrite=common.overwrite, compression=compression, progress=tell)
     print(target)
 
 

@@ -20,14 +20,21 @@ from gyrostab.cf import from_disk, index_dim, to_disk
 from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.output import new_output
 from gyrostab.schema import check_log, check_product, check_surface
-from gyrostab.store import Misfit, append_netcdf, append_zarr, as_counts, chunk_samples, long_variables, open_stored
+from gyrostab.store import Misfit, Progress, append_netcdf, append_zarr, as_counts, chunk_samples, long_variables, open_stored
 
 __all__ = ["open_dataset", "open_log", "open_product", "open_surface", "to_netcdf", "to_zarr"]
 
 _CHUNK = 2**17  # values in one compressed chunk: 1 MiB of float64
 
 
-def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False, compression: str | None = None) -> Path:
+def to_netcdf(
+    dataset: xr.Dataset,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    compression: str | None = None,
+    progress: Progress | None = None,
+) -> Path:
     """Write a product, a DAVAR surface or a log as one flat CF NetCDF file.
 
     Lazy (dask) variables are computed together and chunk by chunk; none is held in memory as a whole.
@@ -43,7 +50,9 @@ def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
     overwrite : bool
         Replace an existing file.
     compression : {"zstd", "zlib"}, optional
-        zstd is four times as fast, zlib is read by every NetCDF program. By default zstd for a log, zlib for everything else.
+        zstd is two to four times as fast, zlib is read by every NetCDF program. By default zstd for a log, zlib for everything else.
+    progress : callable, optional
+        Told the share of a lazy log that is written.
 
     Returns
     -------
@@ -79,7 +88,7 @@ def to_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
         rest = {name: options for name, options in encoding.items() if name not in long}
         with new_output(path, overwrite=overwrite) as temporary:
             packed.drop_vars(long).to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=rest)
-            append_netcdf(temporary, long, encoding)
+            append_netcdf(temporary, long, encoding, progress=progress)
 
     _write_counts(stored, write)
     return Path(path)
@@ -114,7 +123,9 @@ def _filters(compression: str | None, *, log: bool) -> dict[str, Any]:
     return {"zlib": True, "complevel": 4, "shuffle": True}
 
 
-def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+def to_zarr(
+    dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None
+) -> Path:
     """Write a product, a DAVAR surface or a log as a Zarr store (a directory, format 2), by the same rules as `to_netcdf`.
 
     Parameters
@@ -125,6 +136,8 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
         The directory to make.
     overwrite : bool
         Replace an existing store.
+    progress : callable, optional
+        Told the share of a lazy log that is written.
 
     Returns
     -------
@@ -155,7 +168,7 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
         with new_output(path, overwrite=overwrite, directory=True) as temporary:
             whole = packed.drop_vars(long).assign(aligned)
             whole.to_zarr(temporary, mode="w", zarr_format=2, consolidated=not long, encoding=rest, write_empty_chunks=True)
-            append_zarr(temporary, long, encoding)
+            append_zarr(temporary, long, encoding, progress=progress)
 
     _write_counts(stored, write)
     return Path(path)

@@ -5,6 +5,16 @@ gives back the same doubles. A chunk that is missing or damaged becomes a gap, a
 """
 
 from gyrostab.store.read import open_stored
-from gyrostab.store.write import Misfit, append_netcdf, append_zarr, as_counts, chunk_samples, common_packing, long_variables
+from gyrostab.store.write import Misfit, Progress, append_netcdf, append_zarr, as_counts, chunk_samples, common_packing, long_variables
 
-__all__ = ["Misfit", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "common_packing", "long_variables", "open_stored"]
+__all__ = [
+    "Misfit",
+    "Progress",
+    "append_netcdf",
+    "append_zarr",
+    "as_counts",
+    "chunk_samples",
+    "common_packing",
+    "long_variables",
+    "open_stored",
+]

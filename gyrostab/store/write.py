@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.counts import to_counts
 from gyrostab.store.lock import library_lock
 
-__all__ = ["Misfit", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "common_packing", "long_variables"]
+__all__ = ["Misfit", "Progress", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "common_packing", "long_variables"]
 
 CHUNK_SECONDS = 1200.0
 #: Bounds of the samples in one chunk, for very slow and very fast logs.
@@ -23,6 +23,10 @@ CHUNK_LIMITS = (2**16, 2**22)
 #: Size [bytes] of the doubles that are computed at one time while a lazy log is written.
 STRETCH_BYTES = 2**26
 FILLS = {"int16": -32767, "int32": -2147483647}  # the defaults of NetCDF
+
+
+#: Told the share that is done.
+Progress = Callable[[float], None]
 
 
 class Misfit(ValueError):
@@ -96,7 +100,9 @@ def _names(variable: xr.Variable) -> list[str]:
     return [str(dim) for dim in variable.dims]
 
 
-def append_netcdf(path: Path, long: dict[str, xr.Variable], encoding: dict[Any, dict[str, Any]]) -> None:
+def append_netcdf(
+    path: Path, long: dict[str, xr.Variable], encoding: dict[Any, dict[str, Any]], *, progress: Progress | None = None
+) -> None:
     """Add lazy variables to a NetCDF file that holds the others already; `encoding` as for xarray."""
     import netCDF4
 
@@ -120,13 +126,13 @@ def append_netcdf(path: Path, long: dict[str, xr.Variable], encoding: dict[Any, 
             with lock:
                 targets[name][(*row, part)] = values
 
-        _copy(long, {name: encoding[name]["chunksizes"][-1] for name in long}, put)
+        _copy(long, {name: encoding[name]["chunksizes"][-1] for name in long}, put, progress)
     finally:
         with lock:
             file.close()
 
 
-def append_zarr(path: Path, long: dict[str, xr.Variable], encoding: dict[Any, dict[str, Any]]) -> None:
+def append_zarr(path: Path, long: dict[str, xr.Variable], encoding: dict[Any, dict[str, Any]], *, progress: Progress | None = None) -> None:
     """Add lazy variables to a Zarr store that holds the others already, every chunk of them, and gather the metadata."""
     import zarr
 
@@ -149,11 +155,16 @@ def append_zarr(path: Path, long: dict[str, xr.Variable], encoding: dict[Any, di
     def put(name: str, row: tuple[int, ...], part: slice, values: NDArray[Any]) -> None:
         targets[name][(*row, part)] = values
 
-    _copy(long, {name: encoding[name]["chunks"][-1] for name in long}, put)
+    _copy(long, {name: encoding[name]["chunks"][-1] for name in long}, put, progress)
     zarr.consolidate_metadata(path, zarr_format=2)
 
 
-def _copy(long: dict[str, xr.Variable], lengths: dict[str, int], put: Callable[[str, tuple[int, ...], slice, NDArray[Any]], None]) -> None:
+def _copy(
+    long: dict[str, xr.Variable],
+    lengths: dict[str, int],
+    put: Callable[[str, tuple[int, ...], slice, NDArray[Any]], None],
+    progress: Progress | None,
+) -> None:
     """Compute lazy variables a few chunks at a time, for all of them at once, and write each chunk while the next ones are computed."""
     import dask
 
@@ -165,12 +176,16 @@ def _copy(long: dict[str, xr.Variable], lengths: dict[str, int], put: Callable[[
 
     with ThreadPoolExecutor(1, thread_name_prefix="gyrostab-write") as pool:
         writing: Future[None] | None = None
+        done, total = 0, sum(variable.size for variable in long.values())
         for parts in _stretches(long, lengths):
             arrays = [_part(long[name], row, begin, span) for name, row, begin, span in parts]
             blocks = dask.compute(*arrays)
             if writing is not None:
                 writing.result()
             writing = pool.submit(write, [part[:3] for part in parts], blocks)
+            done += sum(span for _, _, _, span in parts)
+            if progress is not None:
+                progress(done / total)
         if writing is not None:
             writing.result()
 
