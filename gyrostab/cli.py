@@ -15,7 +15,7 @@ from cyclopts import App, Parameter
 
 from gyrostab.console import complain, explain, plain_notes, read_config, stoppable
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.options import Common, Fitting, Reading, Running, Windows
+from gyrostab.options import ChannelFile, Common, Fitting, Reading, Running, Windows
 
 __all__ = ["app", "main"]
 
@@ -290,7 +290,7 @@ def correlate(
     with_: Annotated[str, Parameter(name="--with", metavar="CHANNEL")] = "temperature",
     max_lag: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"], metavar="FILE")] = None,
-    reading: Reading = Reading(),
+    other: ChannelFile = ChannelFile(),
     common: Common = Common(),
 ) -> None:
     """Say whether noise coefficients and window means follow temperature or another channel, how much and how late.
@@ -317,17 +317,15 @@ def correlate(
     from gyrostab.read.channel import read_channel
     from gyrostab.run import check_output
 
-    options = reading.options()
-    files = options.pop("channel", ())
-    if len(files) > 1:
-        raise OptionError(f"--channel: {len(files)} files were given; give the one that holds {with_}")
-    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[product, *files]) if output else None
+    given, file = other.options(), other.channel
+    target = (
+        check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[product, *([file] if file else [])]) if output else None
+    )
     picture = check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
     with _work(common) as stage:
         stage("correlating", 0)
         dataset = open_product(product)
-        given = {name: value for name, value in options.items() if name in ("epoch", "map", "unit")}
-        found = compute(dataset, channel=read_channel(files[0], with_, **given) if files else with_, max_lag=max_lag)
+        found = compute(dataset, channel=read_channel(file, with_, **given) if file else with_, max_lag=max_lag)
         if target and picture:
             to_netcdf(join(dataset, found), target, overwrite=common.overwrite)
             with new_output(picture, overwrite=common.overwrite) as temporary:

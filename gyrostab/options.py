@@ -13,7 +13,7 @@ from cyclopts.validators import Number
 
 from gyrostab.errors import OptionError
 
-__all__ = ["Common", "Fitting", "Flag", "Reading", "Running", "Windows", "read_toml"]
+__all__ = ["ChannelFile", "Common", "Fitting", "Flag", "Reading", "Running", "Windows", "read_toml"]
 
 _READING = Group("Reading options", sort_key=1)
 _WINDOWS = Group("Analysis options", sort_key=2)
@@ -69,6 +69,35 @@ class Reading:
             "channel": tuple(self.channel or ()),
         }
         return {name: value for name, value in chosen.items() if value not in (None, (), {}) and value is not False}
+
+
+@Parameter(name="*", group=_READING)
+@dataclass(frozen=True)
+class ChannelFile:
+    """One channel of another file.
+
+    Parameters
+    ----------
+    channel
+        Another file that holds the channel, in any format that gyrostab reads; aligned by its time stamps.
+    epoch
+        Day from which a time column in seconds counts in that file: 2026-11-20 (default 1970-01-01).
+    map
+        Rename a column of that file: T_probe=temperature, or "T_probe=temperature [degC]". Repeat for more columns.
+    unit
+        Unit of a column that has none: temperature=degC. Repeat for more.
+    """
+
+    channel: Annotated[Path | None, Parameter(metavar="FILE")] = None
+    epoch: Annotated[str | None, Parameter(metavar="TIME")] = None
+    map: Annotated[list[str] | None, Parameter(metavar="HEADER=NAME", negative=())] = None
+    unit: Annotated[list[str] | None, Parameter(metavar="NAME=UNIT", negative=())] = None
+
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `gyrostab.read_channel`, apart from the file and the name."""
+        if self.channel is None and (self.epoch or self.map or self.unit):
+            raise OptionError("--epoch, --map and --unit say how to read the file of --channel; name that file too")
+        return {"epoch": self.epoch, "map": _pairs(self.map, "--map"), "unit": _pairs(self.unit, "--unit")}
 
 
 @Parameter(name="*", group=_WINDOWS)
