@@ -278,14 +278,12 @@ def test_stored_stamps_off_the_grid_are_kept_and_said(tmp_path: Path) -> None:
     assert any("stamp 300" in note and "off the grid of 300 Hz" in note for note in back.attrs["notes"])
 
 
-def test_a_log_takes_channels_but_is_not_joined(tmp_path: Path) -> None:
+def test_a_log_takes_channels_and_gives_its_own(tmp_path: Path) -> None:
     path = store(regular_log(), tmp_path / "log.nc")
     extra = write(tmp_path / "extra.csv", "time,pressure [Pa]\n2026-01-01T00:00:01,5\n2026-01-01T00:00:02,6\n")
     log = read_log(path, channel=extra)
     check_log(log)
     np.testing.assert_array_equal(log.pressure, [5, 6])
-    with pytest.raises(OptionError, match=r"log.nc is a regular log already"):
-        read_log([path, store(regular_log(), tmp_path / "second.nc")])
     raw = read_log(write(tmp_path / "raw.csv", "time,gyro_x [deg/h]\n2026-01-01T00:00:00,5\n2026-01-01T00:00:02,6\n"), channel=path)
     assert raw.vibration.sizes["time_vibration"] == 5000
     assert raw.temperature.sizes["time_temperature"] == 4

@@ -18,7 +18,7 @@ from scipy.io import savemat
 
 from gyrostab.errors import FormatError, MissingUnitError, OptionError
 from gyrostab.read import ReadOptions, read_log, readers, scan_file
-from gyrostab.read.buffers import Buffers, lazily, park
+from gyrostab.read.buffers import Buffers, Spool, Stored, lazily, put, take
 from gyrostab.schema import check_raw
 
 ROWS = 500
@@ -312,7 +312,7 @@ def test_shorter_matlab_vectors_are_left_out_with_a_note(tmp_path: Path) -> None
         read_log(path, rate=1)
 
 
-def test_buffers_spill_and_park() -> None:
+def test_buffers_spill_and_give_back() -> None:
     rng = np.random.default_rng(0)
     blocks = [{"a": rng.normal(size=n), "b": np.arange(n)} for n in (5, 1, 30, 7)]
     expected = {key: np.concatenate([block[key] for block in blocks]) for key in "ab"}
@@ -321,8 +321,16 @@ def test_buffers_spill_and_park() -> None:
         for block in blocks:
             buffers.add(block)
         found = buffers.finish()
-        assert isinstance(found["a"], np.memmap) == (limit < 10**6)
+        assert isinstance(found["a"], Stored) == (limit < 10**6)
         for key in "ab":
             np.testing.assert_array_equal(np.asarray(lazily(found[key])), expected[key])
-    matrix = rng.normal(size=(3, 40))
-    np.testing.assert_array_equal(park(matrix).compute(), matrix)
+            for part in (slice(3, 38), slice(6, 6), slice(1, 40, 7), slice(-9, None)):
+                np.testing.assert_array_equal(found[key][part], expected[key][part])
+        rows = np.array([4, 5, 6, 42])
+        np.testing.assert_array_equal(take(found["b"], rows), expected["b"][rows])
+        put(found["b"], rows, -1)
+        np.testing.assert_array_equal(found["b"][:], np.where(np.isin(np.arange(43), rows), -1, expected["b"]))
+    spool = Spool()
+    first, second = spool.store(np.arange(5.0)), spool.store(np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]"))
+    np.testing.assert_array_equal(first[1:3], [1, 2])
+    np.testing.assert_array_equal(second[:], np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]"))

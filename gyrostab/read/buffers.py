@@ -1,9 +1,15 @@
-"""Growing columns that move from memory to unlinked temporary files when they become large."""
+"""Growing columns that move from memory to an unlinked temporary file when they become large.
+
+They are read back with `os.pread`, not mapped: pages of a mapped file would count as memory of this process, more and more of them
+as a long log is gone through, and every map holds a file handle of its own, of which hundreds of files would need thousands.
+"""
 
 from __future__ import annotations
 
+import os
 import tempfile
 import uuid
+from bisect import bisect_right
 from collections.abc import Mapping
 from typing import IO, Any
 
@@ -12,7 +18,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
 
-__all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "lazily", "park"]
+__all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "Spool", "Stored", "lazily", "put", "take"]
 
 #: Columns of one file together stay in memory up to this size [bytes].
 SPILL_BYTES = 128 * 2**20
@@ -21,11 +27,95 @@ SPILL_BYTES = 128 * 2**20
 CHUNK_ROWS = 2**21
 
 
+class Spool:
+    """A temporary file without a name, which the system removes with the last reference to it."""
+
+    def __init__(self) -> None:
+        self.file: IO[bytes] | None = None
+        self.end = 0
+
+    def add(self, values: NDArray[Any]) -> int:
+        """Append an array; the byte at which it begins."""
+        try:
+            if self.file is None:
+                self.file = tempfile.TemporaryFile(prefix="gyrostab-")  # noqa: SIM115
+            self.file.write(values.data)
+            self.file.flush()
+        except OSError as error:
+            where = tempfile.gettempdir()
+            raise OutputError(
+                f"{where}: the columns of a long log are kept there while it is read, and cannot be written ({error.strerror}); "
+                "make room, or name a larger place in the environment variable TMPDIR"
+            ) from error
+        begin, self.end = self.end, self.end + values.nbytes
+        return begin
+
+    def store(self, values: NDArray[Any]) -> Stored:
+        """Move a column to the file."""
+        whole = np.ascontiguousarray(values).view(np.int64)
+        return Stored(self, values.dtype, [0, len(values)], [self.add(whole)])
+
+    @property
+    def handle(self) -> int:
+        """Number of the open file."""
+        assert self.file is not None
+        return self.file.fileno()
+
+
+class Stored:
+    """A column of 8-byte values in a spool, behind the few attributes that dask asks for; dask copies whatever has a ``copy``."""
+
+    ndim = 1
+
+    def __init__(self, spool: Spool, dtype: Any, rows: list[int], places: list[int]):
+        self.spool, self.dtype = spool, np.dtype(dtype)
+        self._rows, self._places = rows, places  # the rows at which the pieces begin, and the end of the last; the bytes they begin at
+        self.shape = (rows[-1],)
+
+    def view(self, dtype: Any) -> Stored:
+        """The same bytes as another type."""
+        return Stored(self.spool, dtype, self._rows, self._places)
+
+    def place(self, row: int) -> int:
+        """The byte at which a row stands."""
+        piece = bisect_right(self._rows, row) - 1
+        return self._places[piece] + 8 * (row - self._rows[piece])
+
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        rows = range(*(part[0] if isinstance(part, tuple) else part).indices(self.shape[0]))
+        out = np.empty(max(rows.stop - rows.start, 0), dtype=np.int64)
+        done = 0
+        while done < len(out):
+            row = rows.start + done
+            most = self._rows[bisect_right(self._rows, row)] - row
+            got = os.preadv(self.spool.handle, [out[done : done + most].data.cast("B")], self.place(row))
+            if got < 8:
+                raise OSError("the temporary file of a long log is shorter than it was")
+            done += got // 8
+        values: NDArray[Any] = out.view(self.dtype)
+        return values[:: rows.step]
+
+
+def take(column: NDArray[Any] | Stored, rows: NDArray[np.int64]) -> NDArray[Any]:
+    """The values of a few rows."""
+    if isinstance(column, Stored):
+        return np.concatenate([np.empty(0, column.dtype), *(column[row : row + 1] for row in rows.tolist())])
+    return np.asarray(column[rows])
+
+
+def put(column: NDArray[Any] | Stored, rows: NDArray[np.int64], value: int) -> None:
+    """Change a few rows."""
+    if isinstance(column, Stored):
+        for row in rows.tolist():
+            os.pwrite(column.spool.handle, np.int64(value).tobytes(), column.place(row))
+    else:
+        column[rows] = value
+
+
 class Buffers:
     """Columns of 8-byte numbers that grow block by block.
 
-    Up to `limit` bytes they are lists of arrays; beyond it each column is appended to a temporary file without a name,
-    which the system removes with the last reference to it.
+    Up to `limit` bytes they are lists of arrays; beyond it they are appended to a spool.
     """
 
     def __init__(self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES):
@@ -33,72 +123,39 @@ class Buffers:
         self.limit = limit
         self.rows = 0
         self._parts: dict[Any, list[NDArray[Any]]] = {key: [] for key in dtypes}
-        self._files: dict[Any, IO[bytes]] = {}
+        self._spool: Spool | None = None
+        self._pieces: dict[Any, tuple[list[int], list[int]]] = {key: ([0], []) for key in dtypes}
 
     def add(self, block: Mapping[Any, NDArray[Any]]) -> None:
         """Append one block: every column, all of one length."""
         self.rows += len(next(iter(block.values())))
         for key, values in block.items():
             self._parts[key].append(np.ascontiguousarray(values, dtype=self.dtypes[key]))
-        if self._files or self.rows * sum(dtype.itemsize for dtype in self.dtypes.values()) > self.limit:
+        if self._spool or self.rows * sum(dtype.itemsize for dtype in self.dtypes.values()) > self.limit:
             self._spill()
 
     def _spill(self) -> None:
+        self._spool = self._spool or Spool()
         for key, parts in self._parts.items():
-            if key not in self._files:
-                self._files[key] = tempfile.TemporaryFile(prefix="gyrostab-")  # noqa: SIM115
+            rows, places = self._pieces[key]
             for part in parts:
-                _write(self._files[key], part)
+                if len(part):
+                    places.append(self._spool.add(part))
+                    rows.append(rows[-1] + len(part))
             parts.clear()
 
-    def finish(self) -> dict[Any, NDArray[Any]]:
-        """The columns: arrays in memory, or memory maps of their files."""
-        if not self._files:
+    def finish(self) -> dict[Any, NDArray[Any] | Stored]:
+        """The columns: arrays in memory, or columns in a temporary file."""
+        if self._spool is None:
             return {key: np.concatenate(parts) if parts else np.empty(0, self.dtypes[key]) for key, parts in self._parts.items()}
-        columns: dict[Any, NDArray[Any]] = {}
-        for key, file in self._files.items():
-            _write(file)
-            columns[key] = np.memmap(file, dtype=self.dtypes[key], mode="r+", shape=(self.rows,))
-        return columns
+        return {key: Stored(self._spool, self.dtypes[key], *pieces) for key, pieces in self._pieces.items()}
 
 
-def _write(file: IO[bytes], *arrays: NDArray[Any]) -> None:
-    """Append arrays to a temporary file and bring it up to date."""
-    try:
-        for values in arrays:
-            file.write(values.data)
-        file.flush()
-    except OSError as error:
-        where = tempfile.gettempdir()
-        raise OutputError(
-            f"{where}: the columns of a long log are kept there while it is read, and cannot be written ({error.strerror}); "
-            "make room, or name a larger place in the environment variable TMPDIR"
-        ) from error
-
-
-class _Mapped:
-    """A memory map behind the few attributes that dask asks for; dask copies into memory whatever has a ``copy``."""
-
-    def __init__(self, values: NDArray[Any]):
-        self._values = values
-        self.shape, self.dtype, self.ndim = values.shape, values.dtype, values.ndim
-
-    def __getitem__(self, part: Any) -> NDArray[Any]:
-        return np.asarray(self._values[part])
-
-
-def lazily(values: NDArray[Any]) -> Any:
-    """A dask array over a memory map; an array in memory is returned as it is."""
-    if not isinstance(values, np.memmap):
+def lazily(values: NDArray[Any] | Stored) -> Any:
+    """A dask array over a column in a temporary file; an array in memory is returned as it is."""
+    if not isinstance(values, Stored):
         return values
     import dask.array
 
-    name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty((0,) * values.ndim, dtype=values.dtype)
-    return dask.array.from_array(_Mapped(values), chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta)
-
-
-def park(values: NDArray[Any]) -> Any:
-    """Move an array from memory to an unlinked temporary file and wrap it as a dask array."""
-    with tempfile.TemporaryFile(prefix="gyrostab-") as file:
-        _write(file, np.ascontiguousarray(values).view(np.int64))
-        return lazily(np.memmap(file, dtype=values.dtype, mode="r+", shape=values.shape))
+    name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
+    return dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.join import some, together
-from gyrostab.read.buffers import park
+from gyrostab.read.buffers import Spool, lazily
 from gyrostab.read.overlap import drop_repeats
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store import common_packing
@@ -24,10 +24,15 @@ def memory(part: xr.Dataset) -> int:
     return sum(variable.nbytes for variable in part.variables.values() if isinstance(variable._data, np.ndarray))
 
 
-def to_disk(part: xr.Dataset) -> xr.Dataset:
-    """The same raw log with its columns in unlinked temporary files."""
-    long = {name: variable for name, variable in part.variables.items() if name != "axis"}
-    return part.assign({name: (v.dims, park(v.values), v.attrs, v.encoding) for name, v in long.items()})
+def to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
+    """The same raw log with its columns in a temporary file."""
+
+    def moved(variable: xr.Variable) -> Any:
+        values = variable.values
+        return lazily(spool.store(values)) if values.ndim == 1 else _dask().stack([lazily(spool.store(row)) for row in values])
+
+    long = {name: variable for name, variable in part.variables.items() if name != "axis" and isinstance(variable._data, np.ndarray)}
+    return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
 
 
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:

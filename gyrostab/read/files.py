@@ -15,7 +15,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.join import join_logs, log_span
-from gyrostab.read.buffers import SPILL_BYTES
+from gyrostab.read.buffers import SPILL_BYTES, Spool
 from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
 from gyrostab.read.lost import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
 from gyrostab.read.options import FileSummary, ReadOptions
@@ -258,6 +258,7 @@ def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | Non
     """Read the files one by one; what does not fit into memory together waits on disk."""
     parts: dict[Path, xr.Dataset] = {}
     lost: list[LostFile] = []
+    spool = Spool()
     held = 0
     for number, path in enumerate(paths, 1):
         if on_file is not None:
@@ -272,7 +273,7 @@ def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | Non
         held += memory(part)
         if held > SPILL_BYTES and len(paths) > 1:
             held -= memory(part)
-            part = to_disk(part)
+            part = to_disk(part, spool)
         parts[path] = part
     check_share(lost, len(paths))
     return parts, lost

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.read.buffers import SPILL_BYTES, Buffers, lazily
+from gyrostab.read.buffers import SPILL_BYTES, Buffers, Stored, lazily, put, take
 from gyrostab.read.columns import Column, Plan
 from gyrostab.read.options import ReadOptions
 from gyrostab.read.stamps import NAT
@@ -170,14 +170,14 @@ class Intake:
         )
         return dataset
 
-    def _stamps(self, columns: dict[int, NDArray[Any]]) -> Any:
+    def _stamps(self, columns: dict[int, NDArray[Any] | Stored]) -> Any:
         if self.time is None:
             return None
         stamps = columns.pop(self.time.source)
         if self.bad_index and self.low <= self.high:
             rows = np.concatenate(self.bad_index)
-            lost = (stamps[rows] < self.low) | (stamps[rows] > self.high)
-            stamps[rows[lost]] = NAT  # scratch numbers in a junk row are no stamp
+            written = take(stamps, rows)
+            put(stamps, rows[(written < self.low) | (written > self.high)], NAT)  # scratch numbers in a junk row are no stamp
         return lazily(stamps.view("datetime64[ns]"))
 
     def _dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:
