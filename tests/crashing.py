@@ -1,0 +1,120 @@
+"""A process that lets runs be killed and continued many times over, quickly: it forks, so nothing is imported or compiled twice.
+
+python -m tests.crashing FOLDER LOG SEED KILLS
+
+prints, as JSON, what became of a kill before every call that changes the disk, and of kills at random moments.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+CALLS = ("replace", "rename", "fsync", "unlink", "rmdir", "mkdir")
+WINDOW = {"window": "4000samples", "step": "4000samples", "taus": "12"}
+
+
+def small_parts() -> None:
+    """Make parts of one unit of work, as a long log would be cut into many."""
+    from gyrostab.davar import davar_parts
+
+    davar_parts.__kwdefaults__["samples"] = 1
+
+
+def make(log: Path, output: Path, **options: object) -> None:
+    from gyrostab.run import run
+
+    run([log], output, windows=WINDOW, workers=2, **options)
+
+
+def forked(action: Callable[[], object], *, after: float | None = None) -> int:
+    """Run in a child process, killed after so many seconds; its exit status, negative for a signal."""
+    child = os.fork()
+    if child == 0:
+        try:
+            action()
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
+    if after is not None:
+        time.sleep(after)
+        os.kill(child, signal.SIGKILL)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def armed(number: int, found: Path) -> Callable[[], None]:
+    """Kill this process before its call `number` that changes the disk; write down how many there were."""
+    count = 0
+
+    def arm() -> None:
+        for name in CALLS:
+            setattr(os, name, wrapped(getattr(os, name)))
+
+    def wrapped(function: Callable[..., object]) -> Callable[..., object]:
+        def call(*arguments: object, **options: object) -> object:
+            nonlocal count
+            if count == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+            count += 1
+            found.write_text(str(count))
+            return function(*arguments, **options)
+
+        return call
+
+    return arm
+
+
+def main(folder: Path, log: Path, seed: int, kills: int) -> dict[str, object]:
+    small_parts()
+    begun = time.perf_counter()
+    make(log, folder / "whole.nc")
+    begun = time.perf_counter()
+    make(log, folder / "whole.nc", overwrite=True)
+    seconds = time.perf_counter() - begun
+    whole = (folder / "whole.nc").read_bytes()
+    wrong: list[str] = []
+
+    def outcome(output: Path, what: str) -> None:
+        status = forked(lambda: make(log, output, resume=True))
+        if status or output.read_bytes() != whole:
+            wrong.append(f"{what}: exit {status}, {'another product' if output.exists() else 'no product'}")
+        left = [path.name for path in folder.iterdir() if output.name in path.name and path != output]
+        if left:
+            wrong.append(f"{what}: left {left}")
+
+    number = 0
+    while True:
+        output, found = folder / f"call{number}.nc", folder / "count"
+
+        def doomed(number: int = number, output: Path = output, found: Path = found) -> None:
+            armed(number, found)()
+            make(log, output)
+
+        if forked(doomed) == 0:
+            break
+        outcome(output, f"killed before call {number}")
+        number += 1
+
+    draw, landed = random.Random(seed), 0
+    for kill in range(kills):
+        output = folder / f"kill{kill % 3}.nc"  # the same output is killed again and again
+        moment = draw.uniform(0.0, 1.05 * seconds)
+        again = output.with_name(f".{output.name}.job").exists()
+        if output.exists():
+            output.unlink()
+        landed += forked(lambda output=output, again=again: make(log, output, resume=again), after=moment) == -signal.SIGKILL
+        if kill % 3 != 1:
+            outcome(output, f"killed after {moment:.3f} s")
+    return {"calls": number, "kills": landed, "seconds": seconds, "wrong": wrong}
+
+
+if __name__ == "__main__":
+    print(json.dumps(main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))))
