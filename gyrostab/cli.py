@@ -318,9 +318,8 @@ def correlate(
     from gyrostab.run import check_output
 
     given, file = other.options(), other.channel
-    target = (
-        check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[product, *([file] if file else [])]) if output else None
-    )
+    inputs = [product, file] if file else [product]
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=inputs) if output else None
     picture = check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
     with _work(common) as stage:
         stage("correlating", 0)

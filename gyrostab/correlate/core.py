@@ -8,13 +8,26 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
 from gyrostab.correlate.dataset import assemble
 from gyrostab.correlate.drivers import Driver, drivers, other_channels, slope_units
 from gyrostab.correlate.judge import VERDICTS, driver_limits, statement
 from gyrostab.errors import OptionError
-from gyrostab.kernels.coupling import averages, fit_lags, noise_family, p_values, search_factor, slope_interval, weights
+from gyrostab.kernels.coupling import (
+    Laws,
+    averages,
+    beside,
+    calibrated,
+    chances,
+    decompose,
+    fit_lags,
+    noise_laws,
+    null_weights,
+    p_values,
+    slope_interval,
+    uncalibrated,
+    weights,
+)
 from gyrostab.noise import TERMS
 from gyrostab.schema import OBSERVABLE, check_product
 from gyrostab.windows import duration_seconds
@@ -22,11 +35,13 @@ from gyrostab.windows import duration_seconds
 __all__ = ["correlate"]
 
 Array = NDArray[np.float64]
-_BLOCKS = 400  # at most; longer records are averaged further
+_BLOCKS = 160  # at most; longer records are averaged further
 _LAGS = 48  # at most
+_SIMULATED = 12  # lags in the simulation of the search, at most: those between tell nothing new
 _PER_WINDOW = 8  # windows used per window length; more add nothing
 _FEWEST = 12
 _CLAIM = 0.05
+_DRAWS = (300, 4000)  # of noise; the second where the first leaves a claim possible
 _LEVERAGE = 0.35  # share of the driver's variance in one block, above which the record hangs on that block
 
 
@@ -38,8 +53,7 @@ class _Frame(NamedTuple):
     pieces: NDArray[np.int64]
     offsets: Array
     trend: Array
-    family: list[Array]
-    prior: Array
+    laws: Laws
 
 
 def correlate(
@@ -110,8 +124,8 @@ def correlate(
         frame = _frame(masks[places[0]], time, length, step, product["window_coverage"].values[places[0][0]])
         series = np.stack([product[names[v]].values[a] for a, v in places], axis=1)[frame.windows] if frame else np.empty((0, len(places)))
         for d, driver in enumerate(found):
-            beside = [product[name].values for name in others]
-            for place, entry in zip(places, _fit(frame, series, driver, beside, lags.astype(np.float64) * step, level), strict=True):
+            others_there = [product[name].values for name in others]
+            for place, entry in zip(places, _fit(frame, series, driver, others_there, lags.astype(np.float64) * step, level), strict=True):
                 entries[(*place, d)] = entry
     _adjust(entries)
     for (a, v, d), entry in entries.items():
@@ -185,67 +199,80 @@ def _frame(mask: NDArray[np.bool_], time: Array, length: float, step: float, sha
     pieces = pieces.astype(np.int64)
     offsets = (pieces[:, None] == np.arange(pieces[-1] + 1)).astype(np.float64)
     trend = ((centre - centre.mean()) / (np.ptp(centre) or 1.0))[:, None]
-    family, prior = noise_family(centre, white)
-    return _Frame(average, windows, pieces, offsets, trend, family, prior)
+    return _Frame(average, windows, pieces, offsets, trend, noise_laws(centre, white))
 
 
-def _fit(frame: _Frame | None, series: Array, driver: Driver, beside: list[Array], lags: Array, level: float) -> list[dict[str, Any]]:
+def _fit(frame: _Frame | None, series: Array, driver: Driver, others: list[Array], lags: Array, level: float) -> list[dict[str, Any]]:
     """Every number of the entries of some series that share their windows, against one driver."""
     if frame is None:
         return [_empty({"too_few"}) for _ in range(series.shape[1])]
     x = np.asarray(frame.average @ driver.values[:, frame.windows].T)
     y = np.asarray(frame.average @ series)
     limits = driver_limits(x[:, 0], frame.pieces, driver.units, derived=driver.name.endswith("_rate"))
-    if limits & {"constant", "too_few"}:
-        return [_empty(limits, windows=frame.windows.size) for _ in range(series.shape[1])]
     timed = np.concatenate([frame.offsets, frame.trend], axis=1)
-    beside = [np.asarray(frame.average @ np.nan_to_num(row[frame.windows])) for row in beside if np.isfinite(row[frame.windows]).all()]
-    more = np.concatenate([timed, *(_unit(row)[:, None] for row in beside if np.ptp(row) > 0)], axis=1)
     nuisance = frame.offsets if "no_reversal" in limits else timed
-    if x.shape[0] - nuisance.shape[1] - 1 < _FEWEST // 2:  # nearly every block is a stretch of its own
-        return [_empty(limits | {"too_few"}, windows=frame.windows.size) for _ in range(series.shape[1])]
-    if _heaviest(x[:, 0], nuisance) > _LEVERAGE:
-        return [_empty(limits | {"one_moment"}, windows=frame.windows.size) for _ in range(series.shape[1])]
-    scale = np.maximum(np.std(y, axis=0), 1e-300)
-    reach = np.maximum(np.std(x, axis=0), 1e-300)
-    fit, units = fit_lags(frame.family, frame.prior, nuisance, (y - y.mean(axis=0)) / scale, (x - x.mean(axis=0)) / reach)
-    p = p_values(fit)
-    plain = 2.0 * stdtr(fit.freedom, -np.abs(fit.slope[0] / fit.stderr[0]))
-    noise = np.random.default_rng(20).normal(size=(y.shape[0], 400))
+    if not limits & {"constant", "too_few"}:
+        if x.shape[0] - nuisance.shape[1] - 1 < _FEWEST // 2:  # nearly every block is a stretch of its own
+            limits = limits | {"too_few"}
+        elif _heaviest(x[:, 0], nuisance) > _LEVERAGE:
+            limits = limits | {"one_moment"}
+    if limits & {"constant", "too_few", "one_moment"}:
+        return [_empty(limits, windows=frame.windows.size) for _ in range(series.shape[1])]
+    others = [np.asarray(frame.average @ np.nan_to_num(row[frame.windows])) for row in others if np.isfinite(row[frame.windows]).all()]
+    more = np.concatenate([timed, *(_unit(row)[:, None] for row in others if np.ptp(row) > 0)], axis=1)
+    laws = beside(frame.laws, nuisance)
+    alone = beside(decompose([_covariance(frame, 0)], np.zeros(1)), nuisance) if "no_reversal" in limits else None
     entries = []
-    for s in range(y.shape[1]):
-        if np.ptp(y[:, s]) == 0.0:
+    for row in y.T:
+        if np.ptp(row) == 0.0:
             entries.append(_empty(limits | {"too_few"}, windows=frame.windows.size))
             continue
-        best = int(np.argmin(p[s]))
-        law = int(np.argmax(weights(fit)[:, s, best]))
-        factor = search_factor(units[law], noise, fit.freedom)
-        turn = scale[s] / reach[best]
-        slope, error, low, high = (value * turn for value in slope_interval(fit, s, best, level))
-        column = x[:, [best]]
-        entry = {
-            "limits": set(limits),
-            "lag": float(lags[best]),
-            "slope": slope,
-            "stderr": error,
-            "low": low,
-            "high": high,
-            "p_value": float(p[s, best]),
-            "p_search": float(-np.expm1(factor * np.log1p(-min(p[s, best], 1 - 1e-12)))),
-            "correlation": _partial(y[:, s], x[:, best], np.ones((y.shape[0], 1))),
-            "partial_time": _partial(y[:, s], x[:, best], timed),
-            "partial_channels": _partial(y[:, s], x[:, best], more),
-            "windows": frame.windows.size,
-            "effective": _effective(y[:, s], x[:, best], nuisance, error),
+        entry = _sensitivity(laws, row, x, lags, level) | {"limits": set(limits), "windows": frame.windows.size}
+        best, column = entry["best"], x[:, entry["best"]]
+        entry |= {
+            "correlation": _partial(row, column, np.ones((row.size, 1))),
+            "partial_time": _partial(row, column, timed),
+            "partial_channels": _partial(row, column, more),
+            "effective": _effective(row, column, nuisance, entry["stderr"]),
         }
-        if "no_reversal" in limits:
-            entry["p_white"] = float(plain[s].min() * factor)
-        entry |= _ramps(frame, law, nuisance, y[:, [s]], column, x[:, 0] if best == 0 else x[:, best])
-        if more.shape[1] > timed.shape[1] and more.shape[1] < y.shape[0] - 3:
-            again, _ = fit_lags(frame.family, frame.prior, more, y[:, [s]] / scale[s], column / reach[best])
+        entry |= _ramps(frame, entry["law"], nuisance, row[:, None], column[:, None])
+        if alone is not None:
+            white = _sensitivity(alone, row, x, lags, level)
+            entry |= {f"{key}_white": white[other] for key, other in (("p", "p_search"), ("slope", "slope"), ("lag", "lag"))}
+        if timed.shape[1] < more.shape[1] < row.size - 3:
+            again = fit_lags(beside(frame.laws, more), row[:, None] / np.std(row), _unit(column)[:, None])
             entry["p_channels"] = float(p_values(again)[0, 0])
         entries.append(entry)
     return entries
+
+
+def _sensitivity(laws: Laws, y: Array, x: Array, lags: Array, level: float) -> dict[str, Any]:
+    """Lag, slope and interval of one series, and how often noise alone would do as much: at that lag, and at any.
+
+    The noise is simulated under the laws by their weights. The interval leaves out 0 where the p-value at that lag is
+    below one less the level, and nowhere else.
+    """
+    scale, reach = float(np.std(y)), np.maximum(np.std(x, axis=0), 1e-300)
+    driver = (x - x.mean(axis=0)) / reach
+    fit = fit_lags(laws, ((y - y.mean()) / scale)[:, None], driver)
+    p = p_values(fit)[0]
+    best = int(np.argmin(p))
+    few = np.unique(np.append(np.linspace(0, lags.size - 1, min(lags.size, _SIMULATED)).astype(np.int64), best))
+    for draws in _DRAWS:
+        chance = chances(laws, driver[:, few], null_weights(fit, 0), draws)
+        alone = chance[:, np.searchsorted(few, best)]
+        single = calibrated(float(p[best]), alone)
+        search = max(single, calibrated(float(p[best]), chance.min(axis=1)))
+        if search > _CLAIM:
+            break
+    found = slope_interval(fit, 0, best, uncalibrated(1.0 - level, alone))
+    slope, error, low, high = (value * scale / float(reach[best]) for value in found)
+    entry = {"best": best, "lag": float(lags[best]), "law": int(np.argmax(weights(fit)[:, 0, best])), "p_value": single, "p_search": search}
+    return entry | {"slope": slope, "stderr": error, "low": low, "high": high}
+
+
+def _covariance(frame: _Frame, law: int) -> Array:
+    return np.asarray(frame.laws.factor[law] @ frame.laws.factor[law].T)
 
 
 def _empty(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
@@ -282,9 +309,10 @@ def _effective(y: Array, x: Array, nuisance: Array, error: float) -> float:
     return float(min(y.size, wanted + nuisance.shape[1] + 1))
 
 
-def _ramps(frame: _Frame, law: int, nuisance: Array, y: Array, x: Array, course: Array) -> dict[str, float]:
+def _ramps(frame: _Frame, law: int, nuisance: Array, y: Array, x: Array) -> dict[str, float]:
     """Slope while the driver rises and while it falls, each with a constant of its own."""
-    up = np.gradient(course) > 0
+    up = np.gradient(x[:, 0]) > 0
+    covariance = _covariance(frame, law)
     out = {}
     for name, part in (("rising", up), ("falling", ~up)):
         keep = np.flatnonzero(part)
@@ -295,7 +323,7 @@ def _ramps(frame: _Frame, law: int, nuisance: Array, y: Array, x: Array, course:
             continue
         if np.linalg.matrix_rank(np.concatenate([columns, _unit(x[keep, 0])[:, None]], axis=1)) <= columns.shape[1]:
             continue
-        fit, _ = fit_lags([frame.family[law][np.ix_(keep, keep)]], frame.prior[[law]], columns, y[keep], x[keep])
+        fit = fit_lags(beside(decompose([covariance[np.ix_(keep, keep)]], np.zeros(1)), columns), y[keep], x[keep])
         out[name], out[f"{name}_stderr"] = float(fit.slope[0, 0, 0]), float(fit.stderr[0, 0, 0])
     return out
 

@@ -48,15 +48,16 @@ def assemble(
 
     kept = [*names, *(["observable"] if set(names) & set(TERMS) else [])]
     result = product[kept].drop_attrs(deep=False).assign_coords(time_bounds=product["time_bounds"])
+    made: dict[str, Any] = {}
     for driver in found:
         what = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
         known = product[driver.name] if driver.name in product.data_vars else ("time", driver.values[0], what)
-        result[driver.name] = known
+        made[driver.name] = known
     for name, (key, label, units) in _NUMBERS.items():
-        result[name] = (dims, table(key), {"long_name": label, "units": units})
-    result["windows_used"] = (dims, table("windows", np.int32), {"long_name": "windows used", "units": "1"})
+        made[name] = (dims, table(key), {"long_name": label, "units": units})
+    made["windows_used"] = (dims, table("windows", np.int32), {"long_name": "windows used", "units": "1"})
     flags = {"flag_values": np.arange(len(VERDICTS), dtype=np.int8), "flag_meanings": " ".join(VERDICTS)}
-    result["coupling_verdict"] = (dims, table("verdict", np.int8), {"long_name": "what the record tells of the coupling", **flags})
+    made["coupling_verdict"] = (dims, table("verdict", np.int8), {"long_name": "what the record tells of the coupling", **flags})
     masks = {name: np.int8(1 << bit) for bit, name in enumerate(LIMITS)}
     bits = np.zeros(shape, np.int8)
     for place, entry in entries.items():
@@ -66,14 +67,15 @@ def assemble(
         "flag_masks": np.array(list(masks.values()), np.int8),
         "flag_meanings": " ".join(masks),
     }
-    result["coupling_limits"] = (dims, bits, limits)
+    made["coupling_limits"] = (dims, bits, limits)
     for v, name in enumerate(names):
         for d, driver in enumerate(found):
             units = slope_units(str(product[name].attrs.get("units", "1")), driver.units)
             for suffix, key in _SLOPES.items():
                 label = f"sensitivity of {name.replace('_', ' ')} to {driver.label}{_said(key, level)}"
-                result[f"{name}_per_{driver.name}{suffix}"] = ("axis", table(key)[:, v, d], {"long_name": label, "units": units})
-    result["statement"] = (dims, table("statement", object).astype(str), {"long_name": "the finding in one sentence"})
+                made[f"{name}_per_{driver.name}{suffix}"] = ("axis", table(key)[:, v, d], {"long_name": label, "units": units})
+    made["statement"] = (dims, table("statement", object).astype(str), {"long_name": "the finding in one sentence"})
+    result = result.assign(made)
     labels = {"variable": (names, "variable of the product"), "driver": ([driver.name for driver in found], "what may drive the variable")}
     result = result.assign_coords({dim: (dim, np.array(values, dtype=str), {"long_name": text}) for dim, (values, text) in labels.items()})
     kept_attrs = ("sampling_rate_hz", "window_s", "step_s", "source_files", "history")

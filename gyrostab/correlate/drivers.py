@@ -18,6 +18,8 @@ __all__ = ["Driver", "drivers", "other_channels", "slope_units"]
 
 Array = NDArray[np.float64]
 
+_SPACINGS = 3.0  # a hole is bridged when it is no longer than this many spacings of the channel, or than a window
+
 # Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS takes "g" for the gram.
 _DIFFERENCE = {"degree_Celsius": "K", "g": "standard_free_fall", "9.80665": "standard_free_fall"}
 
@@ -49,7 +51,8 @@ def drivers(product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.i
     Returns
     -------
     list of Driver
-        Two; NaN where the channel is not known. Gaps shorter than a tenth of the record are bridged, nothing is extrapolated.
+        Two; NaN where the channel is not known. Holes as long as a window or three spacings of the channel are bridged,
+        nothing is extrapolated.
     """
     if isinstance(channel, str):
         if channel not in product.data_vars or product[channel].dims != ("time",):
@@ -98,25 +101,33 @@ def _lagged(whole: Array, before: int, place: NDArray[np.int64], lags: NDArray[n
     return np.where(at >= 0, whole[np.maximum(at, 0)], np.nan)
 
 
-def _bridged(whole: Array) -> Array:
-    """Draw a line across holes no longer than a tenth of the row; ends stay as they are."""
+def _bridged(whole: Array, most: float) -> Array:
+    """Draw a line across holes of at most so many windows; longer ones and the ends stay as they are."""
     known = np.flatnonzero(np.isfinite(whole))
     wide = np.diff(known)
-    for hole in np.flatnonzero((wide > 1) & (wide <= max(3.0, 0.1 * whole.size))):
+    for hole in np.flatnonzero((wide > 1) & (wide - 1 <= most)):
         left, right = known[hole], known[hole + 1]
         whole[left : right + 1] = np.linspace(whole[left], whole[right], right - left + 1)
     return whole
+
+
+def _length(product: xr.Dataset) -> int:
+    """Length of a window [ns]."""
+    bounds = _nanoseconds(product["time_bounds"].values)
+    return int(np.median(bounds[:, 1] - bounds[:, 0]))
 
 
 def _of_product(product: xr.Dataset, name: str, lags: NDArray[np.int64], step: float) -> list[Array]:
     place = _grid(product, step)
     mean = np.full(int(place[-1]) + 1, np.nan)
     mean[place] = product[name].values
-    mean = _bridged(mean)
+    apart = np.diff(np.flatnonzero(np.isfinite(mean)))
+    most = max(_length(product) / 1e9 / step, _SPACINGS * float(np.median(apart)) if apart.size else 0.0) + 1e-6
+    mean = _bridged(mean, most)
     if f"{name}_rate" in product.data_vars:
         rate = np.full(mean.size, np.nan)
         rate[place] = product[f"{name}_rate"].values
-        rate = _bridged(rate)
+        rate = _bridged(rate, most)
     else:
         rate = _slope(mean, step)
     return [_lagged(row, 0, place, lags) for row in (mean, rate)]
@@ -130,19 +141,41 @@ def _slope(mean: Array, step: float) -> Array:
 
 
 def _of_file(channel: xr.DataArray, product: xr.Dataset, lags: NDArray[np.int64], step: float) -> list[Array]:
-    """Mean and slope of a channel on its own time inside the windows, from the longest lag before the first window on."""
+    """Mean and slope of a channel on its own time inside the windows, from the longest lag before the first window on.
+
+    A channel with fewer than two values in a window is interpolated to the middle of the windows instead.
+    """
     values, stamps = _checked(channel, product)
     place, before = _grid(product, step), int(lags[-1])
-    bounds = _nanoseconds(product["time_bounds"].values)
-    start = bounds[0, 0] + np.rint(np.arange(-before, place[-1] + 1) * step * 1e9).astype(np.int64)
-    start[before + place] = bounds[:, 0]
-    length = int(np.median(bounds[:, 1] - bounds[:, 0]))
+    start = np.rint(np.arange(-before, place[-1] + 1) * step * 1e9).astype(np.int64)
+    start += _nanoseconds(product["time_bounds"].values[0, 0])
+    start[before + place] = _nanoseconds(product["time_bounds"].values[:, 0])
+    length = _length(product)
     first, last = np.searchsorted(stamps, start), np.searchsorted(stamps, start + length)
-    mean, rate = window_trend(values, (stamps - stamps[0]) / 1e9, first, last)
-    sparse = np.isfinite(rate).sum() < 0.5 * np.isfinite(mean).sum()
-    mean = _bridged(mean)
-    rate = _slope(mean, step) if sparse else _bridged(rate * HOUR)
+    held = last - first
+    spacing = float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
+    longest = max(length, _SPACINGS * spacing)
+    if spacing > 0.5 * length:
+        mean = _between(values, stamps, start + length // 2, longest)
+        rate = _slope(mean, step)
+    else:
+        mean, rate = window_trend(values, (stamps - stamps[0]) / 1e9, first, last)
+        thin = held < 0.5 * np.median(held[held > 0])
+        mean[thin] = rate[thin] = np.nan
+        most = longest / 1e9 / step + 1e-6
+        mean, rate = _bridged(mean, most), _bridged(rate * HOUR, most)
     return [_lagged(row, before, place, lags) for row in (mean, rate)]
+
+
+def _between(values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], longest: float) -> Array:
+    """A line from each value to the next, NaN before the first, after the last and where two are too far apart."""
+    after = np.clip(np.searchsorted(stamps, at), 1, max(stamps.size - 1, 1))
+    if stamps.size < 2:
+        return np.full(at.size, np.nan)
+    apart = stamps[after] - stamps[after - 1]
+    share = (at - stamps[after - 1]) / np.maximum(apart, 1)
+    inside = (at >= stamps[0]) & (at <= stamps[-1]) & (apart <= longest)
+    return np.where(inside, values[after - 1] + share * (values[after] - values[after - 1]), np.nan)
 
 
 def _checked(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray[np.int64]]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LIMITS", "VERDICTS", "driver_limits", "statement"]
+__all__ = ["LIMITS", "VERDICTS", "chance", "driver_limits", "plain_units", "statement"]
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,39 @@ def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: b
     return found
 
 
+def plain_units(units: str) -> str:
+    """Spell a unit of UDUNITS as people write it.
+
+    Examples
+    --------
+    >>> plain_units("degree hour-1 K-1"), plain_units("degree K-1"), plain_units("K-1"), plain_units("m s-2")
+    ('deg/h/K', 'deg/K', '1/K', 'm/s^2')
+    """
+    above, below = [], ""
+    for word in units.split():
+        name = word.rstrip("-0123456789") or word
+        power = word[len(name) :]
+        name = {"degree": "deg", "hour": "h", "degree_Celsius": "K"}.get(name, name)
+        size = power.removeprefix("-")
+        name += f"^{size}" if size not in ("", "1") else ""
+        if power.startswith("-"):
+            below += f"/{name}"
+        else:
+            above.append(name)
+    return (" ".join(above) or "1") + below
+
+
+def chance(p: float) -> str:
+    """Write a p-value; beyond the reach of the simulation only that it is small.
+
+    Examples
+    --------
+    >>> chance(0.0312), chance(3e-9)
+    ('0.031', '<0.0001')
+    """
+    return "<0.0001" if p < 1e-4 else f"{p:.2g}"
+
+
 def statement(entry: dict[str, Any], driver: str, series: str) -> str:
     """One sentence of plain words about an entry."""
     reasons = [LIMITS[name].format(driver=driver) for name in LIMITS if name in entry["limits"]]
@@ -57,14 +90,23 @@ def statement(entry: dict[str, Any], driver: str, series: str) -> str:
     if verdict == "cannot_tell":
         hard = [LIMITS[name].format(driver=driver) for name in ("constant", "too_few", "clusters", "one_moment") if name in entry["limits"]]
         return f"The record cannot tell whether {series} follows {driver}: {'; '.join(hard) or 'no window holds both'}."
-    number = f"{entry['slope']:.3g} ({entry['low']:.3g} to {entry['high']:.3g}) {entry['units']}"
-    chance = f"p = {max(entry['p_adjusted'], 1e-99):.2g} for the whole search"
+    units = plain_units(entry["units"])
+    between = f"{entry['low']:.3g} to {entry['high']:.3g}"
+    number = f"{entry['slope']:.3g} ({between}) {units}"
     late = f" {entry['lag']:.3g} s later" if entry["lag"] else ""
+    start = series[0].upper() + series[1:]
+    odds = f"p {'' if entry['p_adjusted'] < 1e-4 else '= '}{chance(entry['p_adjusted'])}"
     if verdict == "none_seen":
+        apart = not entry["low"] <= 0.0 <= entry["high"]
+        note = "; at that lag alone it would stand out, in the whole search it does not" if apart else ""
         tail = f" ({'; '.join(reasons)})" if reasons else ""
-        return f"No coupling of {series} with {driver} is seen: {number}, {chance}{tail}."
+        return f"No coupling of {series} with {driver} is seen: {number}{late}, {odds} for the whole search{note}{tail}."
+    if verdict == "not_told_apart" and entry["p_adjusted"] >= 0.05:
+        late = f" {entry['lag_white']:.3g} s later" if entry["lag_white"] else ""
+        return (
+            f"{start} and {driver} change together{late}, by about {entry['slope_white']:.3g} {units}, but "
+            f"{LIMITS['no_reversal'].format(driver=driver)}. Allowing for that, the sensitivity is anything from {between} {units}."
+        )
     if verdict == "not_told_apart":
-        return f"{series[0].upper()}{series[1:]} goes with {driver}{late}, {number}, {chance}, but {'; '.join(reasons)}."
-    return (
-        f"{series[0].upper()}{series[1:]} follows {driver}{late}: {number}, {chance}{' (' + '; '.join(reasons) + ')' if reasons else ''}."
-    )
+        return f"{start} goes with {driver}{late}, {number}, {odds} for the whole search, but {'; '.join(reasons)}."
+    return f"{start} follows {driver}{late}: {number}, {odds} for the whole search{' (' + '; '.join(reasons) + ')' if reasons else ''}."

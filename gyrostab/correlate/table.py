@@ -5,9 +5,50 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.correlate.judge import VERDICTS
+from gyrostab.correlate.judge import VERDICTS, chance, plain_units
 
-__all__ = ["format_correlation"]
+__all__ = ["correlation_rows", "format_correlation"]
+
+
+def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
+    """Write every entry as a row of a table.
+
+    Parameters
+    ----------
+    result : xarray.Dataset
+        Of `gyrostab.correlate`.
+
+    Returns
+    -------
+    list of dict
+        Heading -> text, the same headings in every row; ``-`` where the record cannot tell.
+    """
+    rows = []
+    for a, axis in enumerate(result["axis"].values):
+        for v, name in enumerate(result["variable"].values):
+            for d, driver in enumerate(result["driver"].values):
+                cell = result.isel(axis=a, variable=v, driver=d)
+                slope = cell[f"{name}_per_{driver}"]
+                low, high = (float(cell[f"{name}_per_{driver}_{end}"]) for end in ("low", "high"))
+                numbers = (float(cell["coupling_lag"]), float(slope), float(cell["correlation"]), float(cell["effective_samples"]))
+                lag, value, r, n = ("-" if np.isnan(number) else f"{number:.3g}" for number in numbers)
+                p = float(cell["p_value_adjusted"])
+                rows.append(
+                    {
+                        "axis": str(axis),
+                        "variable": str(name),
+                        "driver": str(driver),
+                        "lag [s]": lag,
+                        "sensitivity": value,
+                        f"{result.attrs['interval_level']:.0%} interval": "-" if np.isnan(low) else f"{low:.3g} .. {high:.3g}",
+                        "unit": plain_units(str(slope.attrs["units"])),
+                        "r": r,
+                        "n eff": n,
+                        "p adjusted": "-" if np.isnan(p) else chance(p),
+                        "verdict": VERDICTS[int(cell["coupling_verdict"])].replace("_", " "),
+                    }
+                )
+    return rows
 
 
 def format_correlation(result: xr.Dataset) -> str:
@@ -23,29 +64,15 @@ def format_correlation(result: xr.Dataset) -> str:
     str
         Text of several lines.
     """
-    rows = [("axis", "variable", "driver", "lag [s]", "sensitivity", "95 % interval", "unit", "r", "n eff", "p adjusted", "verdict")]
-    rows[0] = (*rows[0][:5], f"{result.attrs['interval_level']:.0%} interval", *rows[0][6:])
-    said = []
-    for a, axis in enumerate(result["axis"].values):
-        for v, name in enumerate(result["variable"].values):
-            for d, driver in enumerate(result["driver"].values):
-                cell = result.isel(axis=a, variable=v, driver=d)
-                slope = cell[f"{name}_per_{driver}"]
-                low, high = (float(cell[f"{name}_per_{driver}_{end}"]) for end in ("low", "high"))
-                verdict = VERDICTS[int(cell["coupling_verdict"])]
-                numbers = (float(cell["coupling_lag"]), float(slope), float(cell["correlation"]), float(cell["effective_samples"]))
-                lag, value, r, n = ("-" if np.isnan(number) else f"{number:.3g}" for number in numbers)
-                between = "-" if np.isnan(low) else f"{low:.3g} .. {high:.3g}"
-                p = float(cell["p_value_adjusted"])
-                chance = "-" if np.isnan(p) else f"{p:.2g}"
-                units = str(slope.attrs["units"])
-                rows.append((str(axis), str(name), str(driver), lag, value, between, units, r, n, chance, verdict.replace("_", " ")))
-                if verdict in ("coupled", "not_told_apart"):
-                    said.append(str(cell["statement"].values))
-    cannot = int((result["coupling_verdict"] == 0).sum())
-    if cannot:
-        place = np.argwhere(result["coupling_verdict"].values == 0)[0]
-        said.append(str(result["statement"].values[tuple(place)]) + (f" ({cannot - 1} more like it)" if cannot > 1 else ""))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join([*lines, "", *(said or ["No coupling is seen."])])
+    rows = correlation_rows(result)
+    table = [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
+    verdicts = result["coupling_verdict"].values.ravel()
+    sentences = result["statement"].values.ravel()
+    said = [str(sentences[place]) for place in np.flatnonzero(verdicts >= VERDICTS.index("not_told_apart"))]
+    cannot = np.flatnonzero(verdicts == VERDICTS.index("cannot_tell"))
+    if cannot.size:
+        said.append(str(sentences[cannot[0]]) + (f" ({cannot.size - 1} more like it)" if cannot.size > 1 else ""))
+    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
+    note = "Lag, sensitivity and interval are those of the lag that fits best; p adjusted is for the whole search."
+    return "\n".join([*lines, note, "", *(said or ["No coupling is seen."])])

@@ -6,18 +6,46 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, solve_triangular
+from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 from scipy.special import stdtr, stdtrit
 
-__all__ = ["LagFit", "averages", "fit_lags", "noise_family", "p_values", "search_factor", "slope_interval", "weights", "whiten"]
+__all__ = [
+    "LagFit",
+    "Laws",
+    "averages",
+    "beside",
+    "calibrated",
+    "chances",
+    "decompose",
+    "fit_lags",
+    "mixture",
+    "noise_laws",
+    "null_weights",
+    "p_values",
+    "slope_interval",
+    "uncalibrated",
+    "weights",
+]
 
 Array = NDArray[np.float64]
 
-#: Correlation times of the slow part [share of the record], and its variance within the record against the white part.
+#: Correlation times of the slow part [share of the record], and its spectral density against the white part's at one cycle per record.
 _TIMES = (0.03, 0.1, 0.3, 1.0, 10.0)
-_RATIOS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1e3, 1e4)
-_WHITE_PRIOR = 0.1  # a slow law counts as much beforehand as its correlation time is long: short memory must show itself in the data
+_RATIOS = (1.0, 4.0, 16.0, 64.0, 1e3, 1e4, 1e6)
+_WHITE_PRIOR = 30.0  # against the correlation time for each slow law: a short memory must show itself in the data
+_TAIL = 60  # smallest of the simulated p-values, from which the law of still smaller ones is taken
+_STEEPEST = 1.5  # power of the share against the p-value in the tail, at most
+
+
+class Laws(NamedTuple):
+    """Noise laws of some blocks, beside nuisance columns: factors of the covariances, and what whitens and frees from the nuisance."""
+
+    factor: Array  # (law, n, n)
+    whiten: Array  # (law, n, n)
+    log_det: Array
+    prior: Array
+    freedom: int
 
 
 class LagFit(NamedTuple):
@@ -26,6 +54,7 @@ class LagFit(NamedTuple):
     slope: Array
     stderr: Array
     log_weight: Array
+    log_without: Array  # (law, series)
     freedom: int
 
 
@@ -63,64 +92,78 @@ def averages(block: NDArray[np.int64], time: Array, length: float, share: Array)
     return mean, np.asarray(mean @ time), white
 
 
-def noise_family(centre: Array, white: Array) -> tuple[list[Array], Array]:
-    """Covariances of the blocks under the noise laws that are weighed, and the logarithm of the weight each has beforehand.
+def noise_laws(centre: Array, white: Array) -> Laws:
+    """Noise laws of the blocks that are weighed, and the weight each has beforehand.
 
     White noise alone, and white noise with a slow part: an Ornstein-Uhlenbeck process, which is a random walk when its
     correlation time is longer than the record. Mixtures of several look like flicker noise.
-    """
-    record = float(centre[-1] - centre[0]) or 1.0
-    distance = np.abs(centre[:, None] - centre[None, :]) / record
-    level = float(np.mean(np.diag(white)))
-    family, prior = [white], [_WHITE_PRIOR]
-    for length in _TIMES:
-        slow = level / min(1.0, length) * np.exp(-distance / length)
-        family += [white + ratio * slow for ratio in _RATIOS]
-        prior += [length] * len(_RATIOS)
-    return family, np.log(prior)
-
-
-def whiten(covariance: Array, *columns: Array) -> tuple[float, list[Array]]:
-    """Log determinant of a covariance, and columns multiplied by the inverse of its Cholesky factor."""
-    factor, _ = cho_factor(covariance, lower=True, check_finite=False)
-    both = solve_triangular(factor, np.concatenate(columns, axis=1), lower=True, check_finite=False)
-    return 2.0 * float(np.log(np.diag(factor)).sum()), np.split(both, np.cumsum([column.shape[1] for column in columns])[:-1], axis=1)
-
-
-def fit_lags(family: list[Array], prior: Array, nuisance: Array, series: Array, driver: Array) -> tuple[LagFit, list[Array]]:
-    """Slope of every series on the driver at every lag, beside the nuisance columns, under every noise law.
 
     Parameters
     ----------
-    family : list of float64 (n, n)
-        Covariances.
-    prior : float64 (n_laws,)
-        Logarithm of the weight of each law beforehand.
-    nuisance, series, driver : float64 (n, p), (n, n_series), (n, n_lags)
+    centre : float64 (n,)
+        Times of the blocks [s].
+    white : float64 (n, n)
+        Covariance under white noise.
+
+    Returns
+    -------
+    Laws
+        With no nuisance yet (see `beside`).
+    """
+    record = float(np.ptp(centre)) or 1.0
+    distance = np.abs(centre[:, None] - centre[None, :]) / record
+    density = float(np.mean(np.diag(white))) / centre.size
+    family, prior = [white], [_WHITE_PRIOR]
+    for length in _TIMES:
+        slow = np.exp(-distance / length) * density * (1.0 + (2.0 * np.pi * length) ** 2) / (2.0 * length)
+        family += [white + ratio * slow for ratio in _RATIOS]
+        prior += [length] * len(_RATIOS)
+    return decompose(family, np.log(prior))
+
+
+def decompose(family: list[Array], prior: Array) -> Laws:
+    """Factors of covariances (n, n), each with the logarithm of its weight beforehand."""
+    factor, n = np.linalg.cholesky(np.array(family)), family[0].shape[0]
+    whiten = np.array([solve_triangular(one, np.eye(n), lower=True, check_finite=False) for one in factor])
+    log_det = 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    return Laws(factor, whiten, log_det, np.asarray(prior), n - 1)
+
+
+def beside(laws: Laws, nuisance: Array) -> Laws:
+    """Noise laws beside nuisance columns (n, p): what is whitened is freed from them, and they count in the likelihood."""
+    q, r = np.linalg.qr(laws.whiten @ nuisance)
+    free = laws.whiten - q @ (np.swapaxes(q, 1, 2) @ laws.whiten)
+    log_h = 2.0 * np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))).sum(axis=1)
+    return Laws(laws.factor, free, laws.log_det + log_h, laws.prior, nuisance.shape[0] - nuisance.shape[1] - 1)
+
+
+def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
+    """Slope of every series on the driver at every lag, under every noise law.
+
+    Parameters
+    ----------
+    laws : Laws
+        Of `beside`.
+    series, driver : float64 (n, n_series), (n, n_lags)
         Columns.
 
     Returns
     -------
     LagFit
-        By (law, series, lag); ``log_weight`` is the restricted log likelihood with the slope in the model.
-    list of float64 (n, n_lags)
-        Whitened driver of every law, orthogonal to the nuisance, each of unit length.
+        By (law, series, lag); ``log_weight`` is the restricted log likelihood with the slope in the model, ``log_without``
+        that without it.
     """
-    n, freedom = series.shape[0], series.shape[0] - nuisance.shape[1] - 1
-    shape = (len(family), series.shape[1], driver.shape[1])
-    slope, error, weight, units = np.empty(shape), np.empty(shape), np.empty(shape), []
-    for law, covariance in enumerate(family):
-        log_det, (h, y, x) = whiten(covariance, nuisance, series, driver)
-        q, r = np.linalg.qr(h)
-        y, x = y - q @ (q.T @ y), x - q @ (q.T @ x)
-        xx = np.maximum((x * x).sum(axis=0), 1e-300)
-        xy, yy = y.T @ x, (y * y).sum(axis=0)[:, None]
-        rest = np.maximum(yy - xy**2 / xx, 1e-12 * yy + 1e-300)
-        slope[law], error[law] = xy / xx, np.sqrt(rest / freedom / xx)
-        log_h = 2.0 * np.log(np.abs(np.diag(r))).sum()
-        weight[law] = prior[law] - 0.5 * (log_det + log_h + np.log(xx) + freedom * np.log(rest / n))
-        units.append(x / np.sqrt(xx))
-    return LagFit(slope, error, weight, freedom), units
+    n = series.shape[0]
+    flat = laws.whiten.reshape(-1, n)  # one large product is faster than one for each law
+    y, x = (flat @ series).reshape(-1, n, series.shape[1]), (flat @ driver).reshape(-1, n, driver.shape[1])
+    xx = np.maximum((x * x).sum(axis=1), 1e-30)[:, None, :]
+    yy = (y * y).sum(axis=1)[:, :, None]
+    xy = np.swapaxes(y, 1, 2) @ x
+    rest = np.maximum(yy - xy**2 / xx, 1e-12 * yy + 1e-30)
+    const = (laws.prior - 0.5 * laws.log_det)[:, None, None]
+    weight = const - 0.5 * (np.log(xx) + laws.freedom * np.log(rest / n))
+    without = const[:, :, 0] - 0.5 * (laws.freedom + 1) * np.log(yy[:, :, 0] / n + 1e-30)
+    return LagFit(xy / xx, np.sqrt(rest / laws.freedom / xx), weight, without, laws.freedom)
 
 
 def weights(fit: LagFit) -> Array:
@@ -129,61 +172,79 @@ def weights(fit: LagFit) -> Array:
     return np.asarray(raw / raw.sum(axis=0))
 
 
+def null_weights(fit: LagFit, series: int) -> Array:
+    """Weight of every law if nothing follows the driver."""
+    raw = np.exp(fit.log_without[:, series] - fit.log_without[:, series].max())
+    return np.asarray(raw / raw.sum())
+
+
+def mixture(fit: LagFit) -> tuple[Array, Array]:
+    """Mean and standard deviation of the slope by (series, lag), over the noise laws by their weights."""
+    weight = weights(fit)
+    mean = (weight * fit.slope).sum(axis=0)
+    return mean, np.sqrt((weight * (fit.stderr**2 + (fit.slope - mean) ** 2)).sum(axis=0))
+
+
 def p_values(fit: LagFit) -> Array:
-    """Two-sided p-values of the slopes by (series, lag), averaged over the noise laws by their weights without the driver.
-
-    Weights with the driver would favour, in a search, the laws under which the chosen lag does best.
-    """
-    t = fit.slope / fit.stderr
-    raw = fit.log_weight - 0.5 * fit.freedom * np.log1p(t**2 / fit.freedom)
-    weight = np.exp(raw - raw.max(axis=0))
-    return np.asarray((weight * 2.0 * stdtr(fit.freedom, -np.abs(t))).sum(axis=0) / weight.sum(axis=0))
+    """Two-sided p-values of the slopes by (series, lag), as if mean and standard deviation followed Student's law: see `calibrated`."""
+    mean, spread = mixture(fit)
+    return np.asarray(2.0 * stdtr(fit.freedom, -np.abs(mean / spread)))
 
 
-def slope_interval(fit: LagFit, series: int, lag: int, level: float) -> tuple[float, float, float, float]:
-    """Slope, standard error and interval of one entry under the mixture of the noise laws."""
-    weight, slope, error = weights(fit)[:, series, lag], fit.slope[:, series, lag], fit.stderr[:, series, lag]
-    mean = float(weight @ slope)
-    spread = float(np.sqrt(weight @ (error**2 + (slope - mean) ** 2)))
-    tail = 0.5 * (1.0 - level)
-    ends = []
-    for target in (tail, 1.0 - tail):
-        guess = slope + error * stdtrit(fit.freedom, target)
-        low, high = float(guess.min()), float(guess.max())
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if weight @ stdtr(fit.freedom, (middle - slope) / error) < target else (low, middle)
-        ends.append(0.5 * (low + high))
-    return mean, spread, ends[0], ends[1]
-
-
-def search_factor(unit: Array, noise: Array, freedom: int) -> float:
-    """How many independent tests the search over lags is worth, from the largest of the t-values that noise alone gives.
+def chances(laws: Laws, driver: Array, weight: Array, draws: int = 300, seed: int = 20) -> Array:
+    """P-values by (draw, lag) of noise that has nothing to do with the driver, and follows the laws by their weights.
 
     Parameters
     ----------
-    unit : float64 (n, n_lags)
-        Whitened driver of unit length.
-    noise : float64 (n, n_draws)
-        Independent normal numbers.
-    freedom : int
-        Degrees of freedom of the t-values.
+    laws : Laws
+        Of `beside`.
+    driver : float64 (n, n_lags)
+        Columns.
+    weight : float64 (n_laws,)
+        Weights of the laws in the draws.
+    draws, seed : int
+        How many, and of which numbers.
 
     Returns
     -------
-    float
-        From 1 (all lags tell the same) to the number of lags.
-
-    Examples
-    --------
-    >>> draws = np.random.default_rng(1).normal(size=(50, 2000))
-    >>> column = np.ones((50, 1)) / 50**0.5
-    >>> round(search_factor(np.hstack([column, column]), draws, 48))
-    1
+    float64 (draws, n_lags)
+        What `p_values` says of them.
     """
-    if unit.shape[1] == 1:
-        return 1.0
-    share = (unit.T @ noise) ** 2 / (noise * noise).sum(axis=0)
-    largest = np.sqrt(share / np.maximum(1.0 - share, 1e-12) * freedom).max(axis=0)
-    single = 2.0 * stdtr(freedom, -float(np.quantile(largest, 0.95)))
-    return float(np.clip(np.log(0.95) / np.log1p(-single), 1.0, unit.shape[1]))
+    normal = np.random.default_rng(seed).normal(size=(driver.shape[0], draws))
+    law = np.searchsorted(np.cumsum(weight), (np.arange(draws) + 0.5) / draws * weight.sum() * (1.0 - 1e-12))
+    made = np.concatenate([laws.factor[one] @ normal[:, law == one] for one in np.unique(law)], axis=1)
+    short = Laws(*(np.asarray(part, dtype=np.float32) for part in laws[:-1]), laws.freedom)  # half the time, and enough for a share
+    return p_values(fit_lags(short, made.astype(np.float32), driver.astype(np.float32)))
+
+
+def calibrated(p: float, chance: Array) -> float:
+    """Share of noise that gives a p-value at most as small, from those of simulated noise; small ones by a power law."""
+    p, sample = max(p, 1e-300), np.sort(chance)
+    edge, share, power = _lower_tail(sample)
+    if p < edge:
+        return float(share * (p / edge) ** power)
+    return float(np.interp(p, np.append(sample, 1.0), np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0)))
+
+
+def uncalibrated(share: float, chance: Array) -> float:
+    """The p-value that so great a share of simulated noise stays below: the inverse of `calibrated`."""
+    sample = np.sort(chance)
+    edge, least, power = _lower_tail(sample)
+    if share < least:
+        return float(edge * (share / least) ** (1.0 / power))
+    return float(np.interp(share, np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0), np.append(sample, 1.0)))
+
+
+def _lower_tail(sample: Array) -> tuple[float, float, float]:
+    """The `_TAIL`-th of a sorted sample, the share up to it, and the power (Hill's) by which the share below falls off from there."""
+    count = min(_TAIL, sample.size // 2)
+    edge = float(np.maximum(sample[count - 1], 1e-300))
+    spread = float(np.mean(np.log(edge / np.maximum(sample[:count], 1e-300))))
+    return edge, count / sample.size, min(1.0 / max(spread, 1e-9), _STEEPEST)
+
+
+def slope_interval(fit: LagFit, series: int, lag: int, share: float) -> tuple[float, float, float, float]:
+    """Slope, standard error and interval of one entry: the slopes against which `p_values` is at least `share`."""
+    mean, spread = (float(part[series, lag]) for part in mixture(fit))
+    reach = float(stdtrit(fit.freedom, 1.0 - 0.5 * share)) * spread
+    return mean, spread, mean - reach, mean + reach
