@@ -3,6 +3,7 @@
     python archive.py [archive.toml]
 
 The log may be larger than the memory: it goes to disk on a uniform time axis first, and every later step reads from there.
+Stopped at any moment, it goes on from there when it is started again. A damaged file leaves a gap, and the table says so.
 """
 
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import gyrostab
 from gyrostab.errors import GyrostabError
+from gyrostab.run import load_log, run
 from gyrostab.scan import print_scan
 
 
@@ -22,18 +24,15 @@ def find_logs(folder, *, pattern):
     return logs
 
 
+def is_current(target, *, sources):
+    """Whether a result is there and younger than all that it was made of."""
+    return target.exists() and all(source.stat().st_mtime < target.stat().st_mtime for source in sources)
+
+
 def make_log(logs, target, *, reading):
-    """Put all files on one uniform time axis, with a table of gaps, and open the result without loading it."""
-    raw = gyrostab.read_log(logs, **reading)
-    gyrostab.to_netcdf(gyrostab.regularise(raw), target, overwrite=True)
-    return gyrostab.open_log(target)
-
-
-def make_product(log, target, *, windows, fitting):
-    """Compute the dynamic Allan variance of every axis, and fit the noise coefficients of every window."""
-    surface = gyrostab.davar(log, **windows)
-    gyrostab.to_netcdf(gyrostab.fit_noise(surface, **fitting), target, overwrite=True)
-    return gyrostab.open_product(target)
+    """Put all files on one uniform time axis, with a table of gaps."""
+    print_scan(gyrostab.scan(logs, **reading))
+    gyrostab.to_netcdf(load_log(logs, **reading), target, overwrite=True)
 
 
 def show(product):
@@ -53,11 +52,12 @@ def main(plan_file):
     results.mkdir(parents=True, exist_ok=True)
 
     logs = find_logs(here / plan["logs"]["folder"], pattern=plan["logs"]["pattern"])
-    print_scan(gyrostab.scan(logs, **plan["reading"]))
+    if not is_current(results / "log.nc", sources=[*logs, plan_file]):
+        make_log(logs, results / "log.nc", reading=plan["reading"])
+    steps = {"windows": plan["windows"], "fitting": plan["fitting"]}
+    run([results / "log.nc"], results / "product.nc", **steps, resume=plan["results"]["resume"], overwrite=True)
 
-    log = make_log(logs, results / "log.nc", reading=plan["reading"])
-    product = make_product(log, results / "product.nc", windows=plan["windows"], fitting=plan["fitting"])
-
+    log, product = gyrostab.open_log(results / "log.nc"), gyrostab.open_product(results / "product.nc")
     gyrostab.write_report(product, results / "report.html", log=log, overwrite=True)
     gyrostab.save_figures(product, results / "figures", overwrite=True)
     gyrostab.to_kalibr(product, results / "imu.yaml", overwrite=True)

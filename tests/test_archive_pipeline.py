@@ -39,6 +39,7 @@ def archive(tmp_path_factory) -> tuple[Path, str]:
     (folder / "logs").mkdir()
     for number, day in enumerate(DAYS):
         write_day(folder / "logs", number, day)
+    (folder / "logs" / "run_0.csv").write_text("")  # damaged; it comes first by its name, where it leaves no gap
     for name in ("archive.py", "archive.toml"):
         shutil.copy(ROOT / "pipelines" / name, folder)
     done = subprocess.run([sys.executable, "archive.py"], cwd=folder, capture_output=True, text=True, check=False)
@@ -78,6 +79,23 @@ def test_everything_else_is_there(archive):
     assert all(f"run_{9 - number}.csv" in said for number in range(3))
     with gyrostab.open_log(results / "log.nc") as log:
         assert gyrostab.gap_table(log)["samples"].tolist() == [4 * 3600 * HERTZ] * 2
+
+
+def test_a_damaged_file_is_left_out_and_named(archive):
+    folder, _ = archive
+    with gyrostab.open_product(folder / "results" / "product.nc") as product:
+        assert product.attrs["unreadable_files"] == ["run_0.csv"]
+        assert len(product.attrs["source_files"]) == 3
+
+
+def test_a_second_start_keeps_what_is_complete(archive):
+    folder, _ = archive
+    results = [folder / "results" / name for name in ("log.nc", "product.nc")]
+    before = [path.stat().st_mtime_ns for path in results]
+    done = subprocess.run([sys.executable, "archive.py"], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "product.nc is complete already" in done.stderr
+    assert [path.stat().st_mtime_ns for path in results] == before
 
 
 def test_no_logs_is_said_plainly(tmp_path):
