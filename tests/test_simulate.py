@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from gyrostab.log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.regularise import gap_table
 from gyrostab.schema import check_log
-from gyrostab.simulate import combine, core, drivers, read_model, simulate
+from gyrostab.simulate import combine, drivers, read_model, simulate
 from gyrostab.simulate import environment as env
 from gyrostab.simulate.losses import gaps, losses, power_cuts
 from gyrostab.timegrid import time_coordinate
@@ -101,7 +102,7 @@ def test_every_effect_gives_the_same_bits_whatever_the_chunks():
     world = every_channel(90.0)
     for name, kind in effects().items():
         plain = read_model(model(environment=[WORLD[5]], effect=[]))
-        one = core.replace(plain, effects=(kind.example(),))
+        one = replace(plain, effects=(kind.example(),))
         whole, cut = (simulate(one, environment=world, chunk=chunk).rate.values for chunk in (1800, 331))
         np.testing.assert_array_equal(cut, whole, err_msg=name)
 
@@ -142,7 +143,7 @@ def test_zero_size_changes_nothing_whatever_the_effect():
     plain = read_model(model(environment=[WORLD[5], WORLD[6]], effect=[]))
     before = simulate(plain, environment=world, seed=3).rate.values
     for name, kind in effects().items():
-        off = core.replace(plain, effects=(kind.example().switched_off(),))
+        off = replace(plain, effects=(kind.example().switched_off(),))
         np.testing.assert_array_equal(simulate(off, environment=world, seed=3).rate.values, before, err_msg=name)
 
 
@@ -151,7 +152,7 @@ def test_each_effect_without_its_channel_says_so():
         needs = kind.example().needs()
         if not needs:
             continue
-        bare = core.replace(read_model({"noise": {"N": 0.01}}), effects=(kind.example(),))
+        bare = replace(read_model({"noise": {"N": 0.01}}), effects=(kind.example(),))
         with pytest.raises(SchemaError, match=f"effect '{name}' needs the channel '{needs[0]}'.*there are no channels"):
             simulate(bare, duration="10s", rate=10.0)
 

@@ -6,7 +6,7 @@ import inspect
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,13 @@ from gyrostab.gaps import gap_variables
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
 from gyrostab.schema import GAP_CAUSES, SIGNAL_UNITS, attributes, check_log, log_channels, signal_name
-from gyrostab.simulate.block import BlockState, Plan, Step, check_effects, next_block
+from gyrostab.simulate.block import BlockState, Plan, Step, check_effects
 from gyrostab.simulate.channels import combine, stamp
 from gyrostab.simulate.drivers import make_source
+from gyrostab.simulate.lazy import lazy_rates
 from gyrostab.simulate.model import PROFILES, Model, read_model
-from gyrostab.simulate.noise import NoiseState, Units, begin_noise, draw, stream
-from gyrostab.timegrid import first_stamp, grid_index, grid_times, time_coordinate
+from gyrostab.simulate.noise import begin_noise, stream
+from gyrostab.timegrid import first_stamp, grid_index, time_coordinate
 from gyrostab.windows import duration_seconds
 
 __all__ = ["simulate"]
@@ -98,7 +99,14 @@ def simulate(
     table = _gap_table(world, frame)
     steps = _steps(made, frame, table)
     plan = _plan(made, frame, world, table, steps)
-    data = _blocks(plan, frame, like, chunk or max(1, BLOCK // frame.oversampling), made.flicker_band)
+    starts = [
+        begin_noise(frame.seed, axis, rate=frame.rate * frame.oversampling, terms=_terms(plan, row), flicker_band=made.flicker_band)
+        for row, axis in enumerate(frame.axes)
+    ]
+    signal = None if like is None else like[signal_name(like)].transpose("axis", "time").data
+    data = lazy_rates(
+        plan, _begin(plan, frame.seed), starts, frame.size, missing_in=signal, chunk=chunk or max(1, BLOCK // frame.oversampling)
+    )
     return _labelled(made, frame, world, table, data)
 
 
@@ -250,11 +258,6 @@ def _terms(plan: Plan, row: int) -> str:
     return "".join(term for term in "QNBK" if plan.coefficients[row][term] > 0.0 or term in changed)
 
 
-def _draw(previous: tuple[Any, NoiseState], first: int, size: int, gate: Any) -> tuple[Units, NoiseState]:
-    """The random numbers of the next block of an axis; `gate` only holds them back, so that they do not run far ahead."""
-    return draw(previous[1], first, size)
-
-
 def _begin(plan: Plan, seed: int) -> BlockState:
     counts: dict[str, int] = {}
     states = []
@@ -263,39 +266,6 @@ def _begin(plan: Plan, seed: int) -> BlockState:
         counts[name] = counts.get(name, 0) + 1
         states.append(step.effect.begin(step.setup, stream(seed, "effect", name, counts[name])))
     return BlockState(states)
-
-
-def _blocks(plan: Plan, frame: _Frame, like: xr.Dataset | None, chunk: int, band: tuple[float, float]) -> Any:
-    """The rates as a dask array: chains of blocks, each of which hands its state to the next."""
-    import dask
-    import dask.array as da
-
-    factor = frame.oversampling
-    small = {name: source if source.stamps is not None else replace(source, values=None) for name, source in plan.sources.items()}
-    fixed = dask.delayed(replace(plan, sources=small), traverse=False)
-    more, step = dask.delayed(_draw, pure=False), dask.delayed(next_block, pure=False, nout=2)
-    starts = (
-        begin_noise(frame.seed, axis, rate=frame.rate * factor, terms=_terms(plan, row), flicker_band=band)
-        for row, axis in enumerate(frame.axes)
-    )
-    draws = [dask.delayed((None, state), traverse=False) for state in starts]
-    states: list[Any] = [dask.delayed(_begin(plan, frame.seed), traverse=False)]
-    signal = None if like is None else like[signal_name(like)].transpose("axis", "time").data
-    blocks = []
-    for first in range(0, frame.size, chunk):
-        count = min(chunk, frame.size - first)
-        draws = [more(one, first * factor, count * factor, states[max(0, len(states) - 3)]) for one in draws]
-        before, end = grid_times(frame.start, frame.rate * factor, np.array([max(first * factor - 1, 0), (first + count) * factor - 1]))
-        parts = {}
-        for name, source in plan.sources.items():
-            stretch = source.stretch(int(before), int(end))
-            if stretch is not None:
-                parts[name] = (stretch, source.values[stretch.low : stretch.high])
-        missing = None if signal is None else np.isnan(signal[:, first : first + count])
-        values, state = step(fixed, states[-1], first, count, [one[0] for one in draws], parts, missing)
-        states.append(state)
-        blocks.append(da.from_delayed(values, (len(frame.axes), count), dtype=np.float64))
-    return da.concatenate(blocks, axis=1)
 
 
 def _labelled(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], data: Any) -> xr.Dataset:

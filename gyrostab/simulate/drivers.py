@@ -121,11 +121,13 @@ def _filled(values: Array) -> Array:
 
 
 def _first_number(values: Any, name: str) -> float:
-    for low in range(0, values.size, SHORT):
-        part = np.asarray(values[low : low + SHORT], dtype=np.float64)
+    low, step = 0, 1000  # mostly it is the first one
+    while low < values.size:
+        part = np.asarray(values[low : low + step], dtype=np.float64)
         good = part[~np.isnan(part)]
         if good.size:
             return float(good[0])
+        low, step = low + step, min(SHORT, 8 * step)
     raise SchemaError(f"the channel {name!r} holds no number; leave it out, or name another with driver = ...")
 
 
