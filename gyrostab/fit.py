@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import Any
 
 import dask.array as da
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.covariance import STOCHASTIC, pair_products, ramp_products
+from gyrostab.kernels.covariance import STOCHASTIC, product_tables
 from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
+from gyrostab.kernels.limits import cell_limits, interpolate_quantile
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.noise import LAWS, TERMS, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_surface
@@ -25,6 +27,8 @@ __all__ = ["fit_noise"]
 MOST_TAUS = 48
 #: One-sided normal quantiles: 95 % for limits, 99 % for the claim that a term is there.
 _LIMIT, _CLAIM = 1.6449, 2.3263
+#: More degrees of freedom than this are as good as infinitely many for the limit of a cell.
+_MOST_FREEDOM = 1e6
 #: A column that the other terms imitate to all but this share cannot be told apart.
 _SEPARATION = 1e-4
 
@@ -123,7 +127,7 @@ def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64]) -> xr
     cells, ks, rate, window = _inputs(surface)
     chosen = within[_choose(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
-    tables = _Tables(ks[chosen], shifts, rate, window)
+    tables = _tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window)
 
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = [np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64) for a in arrays]
@@ -152,13 +156,29 @@ class _Tables:
     def __init__(self, ks: NDArray[np.int64], shifts: NDArray[np.int64], rate: float, window: int):
         self.columns = avar_columns(ks / rate)
         self.to_samples = sample_squares(rate)
-        self.pairs = pair_products(window, ks, shifts)
-        self.ramps = ramp_products(window, ks, shifts)
+        self.pairs, self.ramps = product_tables(window, ks, shifts)
         terms = window - 2 * ks + 1
         self.weight = np.array([n**2 / white_pair_sum(int(n), int(k)) for n, k in zip(terms, ks, strict=True)])
         own = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
         #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp has no scatter of its own.
         self.own_dof = np.vstack([2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)])
+        self.quantile = _quantile_curve()
+
+
+def _quantile_curve() -> tuple[float, float, NDArray[np.float64]]:
+    """Lower 5 % point q of chi-square over its degrees of freedom nu, as `interpolate_quantile` reads it: start, step, ``nu ln q``.
+
+    A step of 0.02 in ln nu leaves an error below 1e-9 of q.
+    """
+    start, step = np.log(0.01), 0.02
+    freedom = np.exp(start + step * np.arange(int(np.log(1e15) / step)))
+    return float(start), step, np.asarray(freedom * np.log(gammaincinv(freedom / 2.0, 0.05) * 2.0 / freedom))
+
+
+@lru_cache(maxsize=4)
+def _tables(ks: tuple[int, ...], shifts: tuple[int, ...], rate: float, window: int) -> _Tables:
+    """The same tables for every part of a record that is fitted part by part."""
+    return _Tables(np.array(ks, dtype=np.int64), np.array(shifts, dtype=np.int64), rate, window)
 
 
 def _choose(ks: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -180,7 +200,7 @@ def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -
         stderr = np.where(square > error, error / (2.0 * value), np.sqrt(np.maximum(error, 0.0)) / np.where(square > error, 1.0, 2.0))
         visible = np.isfinite(square) & (field["separation"] > _SEPARATION)
         observed = visible & (square > 0) & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
-        limit = np.minimum(_limit_of_estimate(field), _limit_of_cell(flat, square, dof, tables))
+        limit = np.minimum(_limit_of_estimate(field, tables), _limit_of_cell(flat, square, dof, tables))
         upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
     stderr = np.where(visible, stderr, np.nan)
     value = np.where(visible, value, np.nan)
@@ -188,7 +208,7 @@ def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -
     return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
 
 
-def _limit_of_estimate(field: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+def _limit_of_estimate(field: dict[str, NDArray[np.float64]], tables: _Tables) -> NDArray[np.float64]:
     """95 % upper limit of a squared coefficient from its estimate.
 
     The estimate free of sign has the variance ``a + b s + c s^2`` when the truth is s. The part in ``s^2`` is the
@@ -197,7 +217,7 @@ def _limit_of_estimate(field: dict[str, NDArray[np.float64]]) -> NDArray[np.floa
     """
     estimate = np.maximum(field["free"], 0.0)
     a, b, c = (np.maximum(field[name], 0.0) for name in ("variance_null", "variance_linear", "variance_square"))
-    lower = _low_quantile(2.0 / np.maximum(c, 1e-12))
+    lower = interpolate_quantile(2.0 / np.maximum(c, 1e-12), *tables.quantile)
     curve = 1.0 - (1.0 - lower) ** 2
     half = estimate + 0.5 * _LIMIT**2 * b
     return np.asarray((half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT**2 * a), 0.0))) / curve)
@@ -206,27 +226,9 @@ def _limit_of_estimate(field: dict[str, NDArray[np.float64]]) -> NDArray[np.floa
 def _limit_of_cell(
     flat: list[NDArray[np.float64]], square: NDArray[np.float64], dof: NDArray[np.float64], tables: _Tables
 ) -> NDArray[np.float64]:
-    """95 % upper limit of a squared coefficient from one cell, which cannot be less than the term's own part of it.
-
-    The cell is the one where the fitted model promises the lowest limit, so that its own scatter does not choose it.
-    """
-    avar, white, quantization, factor = flat
-    response = np.ones((*avar.shape, len(TERMS)))
-    response[..., 0], response[..., 1] = quantization, white
-    columns = tables.columns * response
-    model = np.einsum("wka,wa->wk", columns, np.nan_to_num(square))
-    freedom = np.minimum(tables.own_dof.T * factor[..., None], 1e6)
-    freedom[..., -1] = np.minimum(freedom[..., -1], dof)
-    reach = 1.0 / (_low_quantile(freedom) * columns)
-    promised = np.where(np.isfinite(avar)[..., None] & np.isfinite(reach), model[..., None] * reach, np.inf)
-    best = promised.argmin(axis=1)[:, None, :]
-    limit = np.take_along_axis(avar[..., None] * reach, best, axis=1)[:, 0]
-    return np.asarray(np.where(np.isfinite(limit), limit, np.inf))
-
-
-def _low_quantile(freedom: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lower 5 % point of a chi-square over its degrees of freedom."""
-    return np.asarray(gammaincinv(freedom / 2.0, 0.05) * 2.0 / freedom)
+    """95 % upper limit of a squared coefficient from the one cell that can bound it best."""
+    limits = cell_limits(*flat, np.ascontiguousarray(square), dof, tables.columns, tables.own_dof, _MOST_FREEDOM, *tables.quantile)
+    return np.asarray(limits)
 
 
 def _assemble(surface: xr.Dataset, values: list[Any], errors: list[Any], limits: list[Any], observable: list[Any]) -> xr.Dataset:

@@ -20,11 +20,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["STOCHASTIC", "diagonal_products", "pair_products", "ramp_products"]
+from gyrostab.kernels.nonnegative import REORDER
+
+__all__ = ["STOCHASTIC", "diagonal_products", "pair_products", "product_tables"]
 
 #: Number of stochastic terms: quantization, angle random walk, bias instability, rate random walk.
 STOCHASTIC = 4
 
+#: Lags are taken in steps of this share of the shorter factor.
+_FINE = 32
 _FLICKER = 1.0 / (2.0 * math.pi)
 
 
@@ -70,7 +74,7 @@ def _add_smooth(window, k1, k2, logarithm, products, means):  # type: ignore[no-
     """Add the pairs of the terms N, B and K, whose covariances are smooth in the lag on the scale of the shorter factor."""
     n1, n2 = window - 2 * k1 + 1, window - 2 * k2 + 1
     r = np.zeros(STOCHASTIC)
-    step = max(1, min(k1, k2) // 32)
+    step = max(1, min(k1, k2) // _FINE)
     centre = k1 - k2
     reach = min(2 * (k1 + k2), window)
     for lag in range(centre - (reach // step) * step, centre + reach + 1, step):
@@ -107,11 +111,70 @@ def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type
 
 
 @njit(nogil=True, cache=True)
-def _sum_pairs(window, k1, k2, thin, logarithm, products, means):  # type: ignore[no-untyped-def]
-    """Products ``r_a r_b`` and values ``r_a`` averaged over all pairs of terms."""
+def _differences(k, logarithm, out):  # type: ignore[no-untyped-def]
+    """Second differences at distance k of the three autocovariances, at every whole lag; lag 0 is in the middle of `out`."""
+    middle = out.shape[1] // 2
+    for lag in range(middle + 1):
+        white = 0.0
+        flicker = 0.0
+        walk = 0.0
+        for i in range(3):
+            t = abs(lag + (i - 1) * k)
+            weight = -2.0 if i == 1 else 1.0
+            square = float(t) * t
+            white += weight * t
+            flicker += weight * square * logarithm[t]
+            walk += weight * square * t
+        out[0, middle + lag] = out[0, middle - lag] = -0.5 * white
+        out[1, middle + lag] = out[1, middle - lag] = _FLICKER * flicker
+        out[2, middle + lag] = out[2, middle - lag] = walk / 12.0
+
+
+@njit(nogil=True, cache=True, fastmath=REORDER)
+def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no-untyped-def]
+    """What `_add_smooth` adds where it takes every lag, from `_differences` of k1 <= k2.
+
+    Covariances and numbers of pairs are even about the lag k1 - k2, so half of the lags are enough.
+    """
+    scale = 1.0 / (2.0 * k1 * k2)
+    terms = float(window - 2 * k1 + 1)
+    apart = float(k2 - k1)
+    reach = min(2 * (k1 + k2), window)
+    here = np.uint64(differences.shape[1] // 2)
+    near, far = here - np.uint64(k2), here + np.uint64(k2)
+    white, flicker, walk = differences[0], differences[1], differences[2]
+    n = b = k = nn = bb = kk = nb = nk = bk = 0.0
+    for u in range(np.uint64(0), np.uint64(reach + 1)):
+        lag = float(u)
+        weight = max(terms - (apart + lag) - max(apart - lag, 0.0), 0.0) * (2.0 if lag > 0.0 else 1.0)
+        r1 = (white[near + u] - 2.0 * white[here + u] + white[far + u]) * scale
+        r2 = (flicker[near + u] - 2.0 * flicker[here + u] + flicker[far + u]) * scale
+        r3 = (walk[near + u] - 2.0 * walk[here + u] + walk[far + u]) * scale
+        n += weight * r1
+        b += weight * r2
+        k += weight * r3
+        nn += weight * r1 * r1
+        bb += weight * r2 * r2
+        kk += weight * r3 * r3
+        nb += weight * r1 * r2
+        nk += weight * r1 * r3
+        bk += weight * r2 * r3
+    means[1], means[2], means[3] = n, b, k
+    products[1, 1], products[2, 2], products[3, 3] = nn, bb, kk
+    products[1, 2] = products[2, 1] = nb
+    products[1, 3] = products[3, 1] = nk
+    products[2, 3] = products[3, 2] = bk
+
+
+@njit(nogil=True, cache=True)
+def _sum_pairs(window, k1, k2, thin, logarithm, differences, products, means):  # type: ignore[no-untyped-def]
+    """Products ``r_a r_b`` and values ``r_a`` averaged over all pairs of terms; `differences` may be empty."""
     products[:] = 0.0
     means[:] = 0.0
-    _add_smooth(window, k1, k2, logarithm, products, means)
+    if differences.size:
+        _add_every(window, k1, k2, differences, products, means)
+    else:
+        _add_smooth(window, k1, k2, logarithm, products, means)
     _add_quantization(window, k1, k2, thin, logarithm, products, means)
     pairs = float(window - 2 * k1 + 1) * (window - 2 * k2 + 1)
     for a in range(STOCHASTIC):
@@ -127,9 +190,15 @@ def _tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     means = np.zeros((STOCHASTIC, n_tau, n_tau))
     one = np.empty((STOCHASTIC, STOCHASTIC))
     mean = np.empty(STOCHASTIC)
+    widest = 2 * ks[-1] + min(4 * ks[-1], window) + 1
+    differences = np.empty((3, 2 * widest + 1))
     for i in range(n_tau):
+        if ks[i] < 2 * _FINE:
+            _differences(ks[i], logarithm, differences)
+        else:
+            differences = np.empty((3, 0))
         for j in range(i, n_tau):
-            _sum_pairs(window, ks[i], ks[j], 1 << min(shifts[i], shifts[j]), logarithm, one, mean)
+            _sum_pairs(window, ks[i], ks[j], 1 << min(shifts[i], shifts[j]), logarithm, differences, one, mean)
             for a in range(STOCHASTIC):
                 means[a, i, j] = means[a, j, i] = mean[a]
                 for b in range(STOCHASTIC):
@@ -137,36 +206,34 @@ def _tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     return products, means
 
 
-def pair_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Covariance of Allan variances per product of squared coefficients.
+def product_tables(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Covariance of Allan variances per product of squared coefficients, and per product with a ramp.
 
     Parameters
     ----------
     window : int
         Samples of the window; averaging factor k has ``window - 2k + 1`` terms.
     ks : int64 (n_tau,)
-        Averaging factors, at most ``window // 2``.
+        Averaging factors, rising, at most ``window // 2``.
     shifts : int64 (n_tau,)
         Thinning of the terms (every ``2**shift``-th is used).
 
     Returns
     -------
-    ndarray (4, 4, n_tau, n_tau)
+    pairs : ndarray (4, 4, n_tau, n_tau)
         ``P[a, b]``, such that noise with squared coefficients s (in sample units) gives estimates with the covariance
         ``sum_ab s[a] s[b] P[a, b]``.
+    ramps : ndarray (4, n_tau, n_tau)
+        ``D[a]``, such that a rate that grows by rho per sample adds ``rho^2 sum_a s[a] D[a]``.
     """
-    products, _ = _tables(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
-    return np.asarray(2.0 * products)
-
-
-def ramp_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """What a deterministic ramp adds to the covariance, ``rho^2 sum_a s[a] P[a]`` for a rate that grows by rho per sample.
-
-    Parameters are those of `pair_products`; the result has shape (4, n_tau, n_tau).
-    """
-    _, means = _tables(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
     factors = np.asarray(ks, dtype=np.float64)
-    return np.asarray(2.0 * factors[:, None] * factors[None, :] * means)
+    products, means = _tables(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
+    return np.asarray(2.0 * products), np.asarray(2.0 * factors[:, None] * factors[None, :] * means)
+
+
+def pair_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The first of `product_tables`."""
+    return product_tables(window, ks, shifts)[0]
 
 
 @njit(nogil=True, cache=True)
@@ -176,7 +243,7 @@ def _diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     one = np.empty((STOCHASTIC, STOCHASTIC))
     mean = np.empty(STOCHASTIC)
     for i in range(ks.size):
-        _sum_pairs(window, ks[i], ks[i], 1 << shifts[i], logarithm, one, mean)
+        _sum_pairs(window, ks[i], ks[i], 1 << shifts[i], logarithm, np.empty((3, 0)), one, mean)
         for a in range(STOCHASTIC):
             means[a, i] = mean[a]
             for b in range(STOCHASTIC):
@@ -185,7 +252,7 @@ def _diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
 
 
 def diagonal_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Diagonals of `pair_products`, shape (4, 4, n_tau), and of `ramp_products`, shape (4, n_tau), without the rest."""
+    """Diagonals of `product_tables`, shape (4, 4, n_tau), and of its second part, shape (4, n_tau), without the rest."""
     products, means = _diagonals(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
     return np.asarray(2.0 * products), np.asarray(2.0 * np.asarray(ks, dtype=np.float64) ** 2 * means)
 

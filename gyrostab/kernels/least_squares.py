@@ -10,137 +10,43 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gyrostab.kernels.nonnegative import cholesky, solve_lower, solve_nonnegative, solve_subset, solve_upper
+from gyrostab.kernels.mixture import (
+    DATA,
+    LANES,
+    PRODUCTS,
+    combine_products,
+    covariance_rows,
+    degrees_of_freedom,
+    observe,
+    root_squares,
+    variance_parts,
+)
+from gyrostab.kernels.nonnegative import REORDER, back_substitute, eliminate, solve_nonnegative, solve_subset
 
-__all__ = ["FIT_FIELDS", "degrees_of_freedom", "fit_window", "fit_windows", "identify_noise"]
+__all__ = ["FIT_FIELDS", "fit_windows", "identify_noise"]
 
 #: Rows of the per-term result of `fit_windows`.
 FIT_FIELDS = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square", "separation")
 
 
-@njit(nogil=True, cache=True)
-def _take(values, index, n):  # type: ignore[no-untyped-def]
-    """``values[index[:n]]``, which numba compiles ten times slower."""
-    out = np.empty(n)
-    for i in range(n):
-        out[i] = values[index[i]]
-    return out
-
-
-@njit(nogil=True, cache=True)
-def _columns(columns, white, quantization, index, n):  # type: ignore[no-untyped-def]
-    """Design matrix of the valid cells, with the responses to white and quantization noise seen through the gaps."""
-    design = np.empty((n, columns.shape[1]))
-    for i in range(n):
-        for a in range(columns.shape[1]):
-            response = quantization[index[i]] if a == 0 else (white[index[i]] if a == 1 else 1.0)
-            design[i, a] = columns[index[i], a] * response
-    return design
-
-
-@njit(nogil=True, cache=True)
-def _amounts(squares, to_samples, columns, white, quantization, out):  # type: ignore[no-untyped-def]
-    """Squared coefficients of the stochastic terms in sample units, as one cell sees them through the gaps.
-
-    What the gaps add to quantization noise comes from the ends of many runs spread over each cluster, so it scatters
-    like white noise and is counted there.
-    """
-    excess = max(quantization - 1.0, 0.0) * columns[0] / columns[1]
-    out[0] = squares[0] * min(quantization, 1.0) * to_samples[0]
-    out[1] = (squares[1] * white + squares[0] * excess) * to_samples[1]
-    out[2] = squares[2] * to_samples[2]
-    out[3] = squares[3] * to_samples[3]
-
-
-@njit(nogil=True, cache=True)
-def _covariance(squares, to_samples, columns, white, quantization, factor, pairs, ramps, index, n, out):  # type: ignore[no-untyped-def]
-    """Covariance of the valid cells for squared coefficients `squares`; `out` (n, n) is overwritten."""
-    root = np.empty((4, n))
-    amounts = np.empty(4)
-    for i in range(n):
-        cell = index[i]
-        _amounts(squares, to_samples, columns[cell], white[cell], quantization[cell], amounts)
-        for a in range(4):
-            root[a, i] = np.sqrt(max(amounts[a], 0.0))
-    ramp = max(squares[4], 0.0) * to_samples[4]
-    for i in range(n):
-        for j in range(i + 1):
-            p, q = index[i], index[j]
-            total = 0.0
-            for a in range(4):
-                amplitude = root[a, i] * root[a, j]
-                if amplitude == 0.0:
-                    continue
-                total += ramp * amplitude * ramps[a, p, q]
-                for b in range(4):
-                    total += amplitude * root[b, i] * root[b, j] * pairs[a, b, p, q]
-            total /= max(factor[p], factor[q])  # the poorer cell uses a part of what the richer one uses
-            out[i, j] = total
-            out[j, i] = total
-
-
-@njit(nogil=True, cache=True)
-def _quick(y, weight, factor, index, design, allowed, squares):  # type: ignore[no-untyped-def]
+@njit(nogil=True, cache=True, error_model="numpy")
+def _quick(system, weight, factor, normal, right, allowed, squares):  # type: ignore[no-untyped-def]
     """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise."""
-    terms = design.shape[1]
-    normal = np.zeros((terms, terms))
-    right = np.zeros(terms)
-    for i in range(y.size):
-        w = weight[index[i]] * factor[index[i]] / (y[i] * y[i])
-        for a in range(terms):
-            right[a] += w * design[i, a] * y[i]
-            for b in range(terms):
-                normal[a, b] += w * design[i, a] * design[i, b]
+    normal[:] = 0.0
+    right[:] = 0.0
+    for i in range(weight.size):
+        y = system[i, DATA]
+        if y == 0.0:
+            continue
+        w = weight[i] * factor[i] / (y * y)
+        for a in range(5):
+            right[a] += w * system[i, a] * y
+            for b in range(5):
+                normal[a, b] += w * system[i, a] * system[i, b]
     return solve_nonnegative(normal, right, allowed, squares)
 
 
-@njit(nogil=True, cache=True)
-def _valid(avar, factor, index):  # type: ignore[no-untyped-def]
-    n = 0
-    for i in range(avar.size):
-        if np.isfinite(avar[i]) and avar[i] > 0.0 and factor[i] > 0.0:
-            index[n] = i
-            n += 1
-    return n
-
-
-@njit(nogil=True, cache=True)
-def degrees_of_freedom(squares, to_samples, columns, white, quantization, factor, pairs, ramps):  # type: ignore[no-untyped-def]
-    """Equivalent degrees of freedom of each cell under a mixture of noises, ``2 mean^2 / variance``.
-
-    Parameters
-    ----------
-    squares : float64 (5,)
-        Squared coefficients.
-    to_samples : float64 (5,)
-        Squared coefficient to sample units (rate per sample, interval 1).
-    columns : float64 (n_tau, 5)
-        Allan variance per squared coefficient.
-    white, quantization, factor : float64 (n_tau,)
-        Responses seen through the gaps, and degrees of freedom left as a share.
-    pairs : float64 (4, 4, n_tau); ramps : float64 (4, n_tau)
-        Diagonals of `pair_products` and `ramp_products`.
-    """
-    n_tau = columns.shape[0]
-    out = np.zeros(n_tau)
-    amounts = np.empty(4)
-    for i in range(n_tau):
-        mean = 0.0
-        for a in range(5):
-            response = quantization[i] if a == 0 else (white[i] if a == 1 else 1.0)
-            mean += squares[a] * response * columns[i, a]
-        variance = 0.0
-        _amounts(squares, to_samples, columns[i], white[i], quantization[i], amounts)
-        for a in range(4):
-            variance += amounts[a] * squares[4] * to_samples[4] * ramps[a, i]
-            for b in range(4):
-                variance += amounts[a] * amounts[b] * pairs[a, b, i]
-        if variance > 0.0:
-            out[i] = 2.0 * mean * mean / variance * factor[i]
-    return out
-
-
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def identify_noise(avar, white, quantization, factor, columns, weight, to_samples, pairs, ramps):  # type: ignore[no-untyped-def]
     """Degrees of freedom of each cell with the noise mixture identified by a quick fit of the window.
 
@@ -148,97 +54,43 @@ def identify_noise(avar, white, quantization, factor, columns, weight, to_sample
     ----------
     avar, white, quantization, factor : float64 (n_windows, n_tau)
         Cells and what the gaps do to them.
-    columns, to_samples, pairs, ramps
-        As in `degrees_of_freedom`.
+    columns : float64 (n_tau, 5)
+        Allan variance per squared coefficient.
     weight : float64 (n_tau,)
         Degrees of freedom for white noise, the weights of the quick fit.
+    to_samples : float64 (5,)
+        Squared coefficient to sample units (rate per sample, interval 1).
+    pairs : float64 (4, 4, n_tau); ramps : float64 (4, n_tau)
+        `diagonal_products`.
 
     Returns
     -------
     float64 (n_windows, n_tau)
     """
+    n_tau = avar.shape[1]
     out = np.full(avar.shape, np.nan)
+    diagonal = np.empty((n_tau, PRODUCTS))
+    for i in range(n_tau):
+        table = 0
+        for a in range(4):
+            for b in range(a, 5):
+                diagonal[i, table] = ramps[a, i] if b == 4 else pairs[a, b, i] * (1.0 if a == b else 2.0)
+                table += 1
     squares = np.empty(5)
-    index = np.empty(avar.shape[1], np.int64)
+    system, seen, inverse = np.empty((n_tau, LANES)), np.empty((6, n_tau)), np.empty(n_tau)
+    normal, right = np.empty((5, 5)), np.empty(5)
     for w in range(avar.shape[0]):
-        n = _valid(avar[w], factor[w], index)
-        if n == 0:
-            continue
-        design = _columns(columns, white[w], quantization[w], index, n)
-        _quick(_take(avar[w], index, n), weight, factor[w], index, design, 31, squares)
-        dof = degrees_of_freedom(squares, to_samples, columns, white[w], quantization[w], factor[w], pairs, ramps)
-        for i in range(n):
-            out[w, index[i]] = dof[index[i]]
+        if observe(avar[w], white[w], quantization[w], factor[w], columns, to_samples, system, seen, inverse):
+            _quick(system, weight, factor[w], normal, right, 31, squares)
+            degrees_of_freedom(squares, avar[w], white[w], quantization[w], factor[w], columns, to_samples, diagonal, out[w])
+            for i in range(n_tau):
+                if system[i, DATA] == 0.0:
+                    out[w, i] = np.nan
     return out
 
 
-@njit(nogil=True, cache=True)
-def _normal_equations(y, design, factor, n):  # type: ignore[no-untyped-def]
-    """Whiten with the Cholesky factor of the covariance: normal matrix, right-hand side and whitened data."""
-    terms = design.shape[1]
-    whitened = np.empty((terms, n))
-    data = y.copy()
-    solve_lower(factor, n, data)
-    for a in range(terms):
-        for i in range(n):
-            whitened[a, i] = design[i, a]
-        solve_lower(factor, n, whitened[a])
-    normal = np.empty((terms, terms))
-    right = np.empty(terms)
-    for a in range(terms):
-        right[a] = 0.0
-        for i in range(n):
-            right[a] += whitened[a, i] * data[i]
-        for b in range(terms):
-            normal[a, b] = 0.0
-            for i in range(n):
-                normal[a, b] += whitened[a, i] * whitened[b, i]
-    return normal, right, whitened, data
-
-
-@njit(nogil=True, cache=True)
-def _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, result):  # type: ignore[no-untyped-def]
-    """Estimate of one term, free of sign beside the chosen ones, and how its variance grows with the term itself."""
-    terms, n = whitened.shape
-    subset = chosen | 1 << a
-    unit = np.zeros(terms)
-    unit[a] = 1.0
-    scale = np.empty(terms)
-    for b in range(terms):
-        scale[b] = 1.0 / np.sqrt(normal[b, b]) if normal[b, b] > 0.0 else 0.0
-    scaled = np.empty((terms, terms))
-    for b in range(terms):
-        unit[b] *= scale[b]
-        for c in range(terms):
-            scaled[b, c] = normal[b, c] * scale[b] * scale[c]
-    row = np.empty(terms)
-    if not solve_subset(scaled, unit, subset, row):
-        result[6, a] = 0.0
-        return
-    result[0, a] = squares[a]
-    result[2, a] = 0.0
-    weights = np.zeros(n)
-    for b in range(terms):
-        row[b] *= scale[b]  # row a of the inverse normal matrix: the estimator is the sum of row[b] right[b]
-        result[2, a] += row[b] * right[b]
-        for i in range(n):
-            weights[i] += row[b] * whitened[b, i]
-    result[1, a] = np.sqrt(max(row[a], 0.0))
-    solve_upper(factor, n, weights)  # estimator as weights on the cells
-    for p in range(3):  # spread[0]: covariance without the term; [1]: growth with it; [2]: its own square
-        total = 0.0
-        for i in range(n):
-            for j in range(n):
-                total += weights[i] * weights[j] * spread[p, i, j]
-        result[3 + p, a] = total
-    if solve_subset(scaled, unit, allowed, row):
-        result[6, a] = 1.0 / max(row[a] * scale[a] * normal[a, a], 1.0)
-    else:
-        result[6, a] = 0.0
-
-
-@njit(nogil=True, cache=True)
-def _without(a, squares, design, trial):  # type: ignore[no-untyped-def]
+@njit(nogil=True, cache=True, error_model="numpy")
+def _without(a, squares, system, first, last, trial):  # type: ignore[no-untyped-def]
     """The noise if term `a` were not there and the neighbour most like it had made the same Allan variance instead.
 
     A ramp or a flicker floor is claimed only against a random walk that would reach as high at the longest averaging
@@ -247,92 +99,155 @@ def _without(a, squares, design, trial):  # type: ignore[no-untyped-def]
     for b in range(squares.size):
         trial[b] = squares[b]
     trial[a] = 0.0
-    cell, stand_in = design.shape[0] - 1, -1
+    cell, stand_in = last, -1
     if a == 0:
-        cell, stand_in = 0, 1
+        cell, stand_in = first, 1
     elif a == 2 or a == 4:
         stand_in = 3
     if stand_in >= 0:
-        trial[stand_in] += squares[a] * design[cell, a] / design[cell, stand_in]
+        trial[stand_in] += squares[a] * system[cell, a] / system[cell, stand_in]
 
 
-@njit(nogil=True, cache=True)
-def _spread(a, squares, design, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread):  # type: ignore[no-untyped-def]
-    """Covariance of the cells as a polynomial in the squared coefficient of term `a`: constant, linear and square parts."""
-    trial = np.empty(squares.size)
-    _without(a, squares, design, trial)
-    _covariance(trial, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread[0])
+@njit(nogil=True, cache=True, error_model="numpy")
+def _growth(a, squares, system, seen, inverse, tables, root, weights, part, trial, result):  # type: ignore[no-untyped-def]
+    """Variance of the estimate of term `a` as a polynomial in its square: rows 3, 4 and 5 of `result`."""
+    first, last = 0, seen.shape[1] - 1
+    while system[first, DATA] == 0.0:
+        first += 1
+    while system[last, DATA] == 0.0:
+        last -= 1
+    _without(a, squares, system, first, last, trial)
+    parts = np.empty(3)
+    if a > 1 or (a == 1 and trial[0] == 0.0) or seen[2].max() == 0.0:
+        trial[a] = 1.0
+        root_squares(trial, seen, root)
+        variance_parts(root, a, inverse, tables, weights, part, parts)
+        for p in range(3):
+            result[3 + p, a] = parts[p]
+        return
+    # quantization noise that counts as white (see observe) makes the terms one; the growth is that of the first unit
+    root_squares(trial, seen, root)
+    variance_parts(root, -1, inverse, tables, weights, part, parts)
+    result[3, a] = parts[0]
     trial[a] = 1.0
-    _covariance(trial, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread[1])
-    trial[:] = 0.0
-    trial[a] = 1.0
-    _covariance(trial, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread[2])
-    for i in range(n):
-        for j in range(n):
-            spread[1, i, j] -= spread[0, i, j] + spread[2, i, j]
+    root_squares(trial, seen, root)
+    variance_parts(root, -1, inverse, tables, weights, part, parts)
+    both = parts[0]
+    for b in range(5):
+        trial[b] = 1.0 if a == b else 0.0
+    root_squares(trial, seen, root)
+    variance_parts(root, -1, inverse, tables, weights, part, parts)
+    result[5, a] = parts[0]
+    result[4, a] = both - result[3, a] - parts[0]
 
 
-@njit(nogil=True, cache=True)
-def _factorise(squares, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, data, factor):  # type: ignore[no-untyped-def]
-    """Cholesky factor of the covariance of the valid cells; False when it is hopeless."""
-    n = data.size
+@njit(nogil=True, cache=True, fastmath=REORDER, error_model="numpy")
+def _normal_equations(system, normal, right):  # type: ignore[no-untyped-def]
+    """Normal matrix and right-hand side from whitened columns and data."""
+    normal[:] = 0.0
+    right[:] = 0.0
+    for i in range(system.shape[0]):
+        for a in range(5):
+            right[a] += system[i, a] * system[i, DATA]
+            for b in range(5):
+                normal[a, b] += system[i, a] * system[i, b]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _whiten(root, inverse, tables, system, whole, whitened):  # type: ignore[no-untyped-def]
+    """Whitened columns and data; False when the covariance is hopeless. `whole` keeps the factor of the covariance."""
+    n = root.shape[1]
     jitter = 1e-7  # the sums over lags are good to about this; a strong ramp may need more
     while jitter < 1.0:
-        _covariance(squares, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, factor)
-        for i in range(n):  # the second part keeps a window without any noise solvable
-            factor[i, i] += jitter * factor[i, i] + 1e-16 * data[i] * data[i]
-        if cholesky(factor, n):
+        covariance_rows(root, inverse, tables, whole)
+        for i in range(n):
+            if system[i, DATA] == 0.0:
+                whole[i, i] = 1.0
+            else:  # the second part keeps a window without any noise solvable
+                whole[i, i] += jitter * whole[i, i] + 1e-16 * system[i, DATA] ** 2
+            for a in range(LANES):
+                whole[i, n + a] = system[i, a]
+        if eliminate(whole):
+            for i in range(n):
+                for a in range(LANES):
+                    whitened[i, a] = whole[i, n + a]
             return True
         jitter *= 10.0
     return False
 
 
-@njit(nogil=True, cache=True)
-def fit_window(y, white, quantization, gap_factor, columns, to_samples, pairs, ramps, weight, allowed, result):  # type: ignore[no-untyped-def]
-    """Fit one window; returns chi-square, degrees of freedom and the number of usable cells (arguments as `fit_windows`)."""
-    index = np.empty(y.size, np.int64)
-    n = _valid(y, gap_factor, index)
-    terms = columns.shape[1]
-    result[:] = np.nan
-    if n == 0:
-        return np.nan, 0, 0
-    data = _take(y, index, n)
-    design = _columns(columns, white, quantization, index, n)
-    squares = np.zeros(terms)
-    chosen = _quick(data, weight, gap_factor, index, design, allowed, squares)
-    factor = np.empty((n, n))
-    normal = np.zeros((terms, terms))
-    right = np.zeros(terms)
-    whitened = np.zeros((terms, n))
-    rest = data
+@njit(nogil=True, cache=True, error_model="numpy")
+def _estimate(a, chosen, allowed, normal, right, squares, row, work, members, result):  # type: ignore[no-untyped-def]
+    """Estimate of one term, free of sign beside the chosen ones; its weights on the right-hand sides to `row`.
+
+    Returns False when the term cannot be told from the chosen ones.
+    """
+    scale, unit, scaled, scratch = work[0], work[1], work[2:7], work[7:12]
+    for b in range(5):
+        scale[b] = 1.0 / np.sqrt(normal[b, b]) if normal[b, b] > 0.0 else 0.0
+        unit[b] = scale[b] if a == b else 0.0
+    for b in range(5):
+        for c in range(5):
+            scaled[b, c] = normal[b, c] * scale[b] * scale[c]
+    result[6, a] = 0.0
+    if not solve_subset(scaled, unit, chosen | 1 << a, row, scratch, members):
+        return False
+    if solve_subset(scaled, unit, allowed, row, scratch, members):
+        result[6, a] = 1.0 / max(row[a] * scale[a] * normal[a, a], 1.0)
+    solve_subset(scaled, unit, chosen | 1 << a, row, scratch, members)
+    result[0, a] = squares[a]
+    result[2, a] = 0.0
+    for b in range(5):  # row a of the inverse normal matrix: the estimator is the sum of row[b] right[b]
+        row[b] *= scale[b]
+        result[2, a] += row[b] * right[b]
+    result[1, a] = np.sqrt(max(row[a], 0.0))
+    return True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _iterate(system, seen, inverse, tables, allowed, chosen, squares, root, whole, whitened, normal, right):  # type: ignore[no-untyped-def]
+    """Refit `squares` until the covariance is that of the fitted noise; returns the terms above zero, -1 where it is hopeless."""
+    previous = np.empty(5)
     for _ in range(6):
-        previous = squares.copy()
-        if not _factorise(squares, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, data, factor):
-            return np.nan, 0, n
-        normal, right, whitened, rest = _normal_equations(data, design, factor, n)
-        chosen = solve_nonnegative(normal, right, allowed, squares)
+        for a in range(5):
+            previous[a] = squares[a]
+        root_squares(squares, seen, root)
+        if not _whiten(root, inverse, tables, system, whole, whitened):
+            return -1
+        _normal_equations(whitened, normal, right)
+        chosen = solve_nonnegative(normal, right, allowed, squares, chosen)
         moved = False
-        for a in range(terms):
+        for a in range(5):
             moved = moved or abs(squares[a] - previous[a]) > 1e-4 * previous[a]
         if not moved:
             break
-    used = 0
-    spread = np.empty((3, n, n))
-    for a in range(terms):
-        if allowed >> a & 1:
-            used += chosen >> a & 1
-            _spread(a, squares, design, to_samples, columns, white, quantization, gap_factor, pairs, ramps, index, n, spread)
-            _term(a, chosen, allowed, normal, right, whitened, factor, squares, spread, result)
+    return chosen
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _judge(chosen, allowed, squares, system, seen, inverse, tables, root, whole, whitened, normal, right, work, result):  # type: ignore[no-untyped-def]
+    """Estimates of all terms with their errors, separations and growing variances; returns chi-square."""
+    n = seen.shape[1]
+    row, part, weights, scratch, members = np.empty(5), work[0], work[1], np.empty((12, 5)), np.empty(5, np.int64)
+    for a in range(5):
+        if not allowed >> a & 1 or not _estimate(a, chosen, allowed, normal, right, squares, row, scratch, members, result):
+            continue
+        for i in range(n):
+            weights[i] = 0.0
+            for b in range(5):
+                weights[i] += row[b] * whitened[i, b]
+        back_substitute(whole, weights)  # estimator as weights on the cells
+        _growth(a, squares, system, seen, inverse, tables, root, weights, part, row, result)
     chi2 = 0.0
     for i in range(n):
-        misfit = rest[i]
-        for a in range(terms):
-            misfit -= squares[a] * whitened[a, i]
+        misfit = whitened[i, DATA]
+        for a in range(5):
+            misfit -= squares[a] * whitened[i, a]
         chi2 += misfit * misfit
-    return chi2, n - used, n
+    return chi2
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pairs, ramps, weight, allowed):  # type: ignore[no-untyped-def]
     """Fit every window.
 
@@ -345,7 +260,7 @@ def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pair
     to_samples : float64 (5,)
         Squared coefficient to sample units.
     pairs : float64 (4, 4, n_tau, n_tau); ramps : float64 (4, n_tau, n_tau)
-        `pair_products` and `ramp_products`.
+        `product_tables`.
     weight : float64 (n_tau,)
         Degrees of freedom for white noise, the weights of the first pass.
     allowed : int
@@ -363,28 +278,33 @@ def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pair
         Equivalent degrees of freedom of the cells under the fitted noise.
     """
     n_windows, n_tau = avar.shape
-    result = np.empty((n_windows, len(FIT_FIELDS), columns.shape[1]))
-    misfit = np.empty((n_windows, 2))
-    dof = np.full((n_windows, n_tau), np.nan)
-    diagonal = np.empty((4, 4, n_tau))
-    ramp_diagonal = np.empty((4, n_tau))
+    size = (n_tau + LANES - 1) // LANES * LANES
+    tables = np.zeros((size, PRODUCTS, size))
+    combine_products(pairs, ramps, tables)
+    diagonal = np.empty((n_tau, PRODUCTS))
     for i in range(n_tau):
-        for a in range(4):
-            ramp_diagonal[a, i] = ramps[a, i, i]
-            for b in range(4):
-                diagonal[a, b, i] = pairs[a, b, i, i]
-    squares = np.empty(columns.shape[1])
+        diagonal[i] = tables[i, :, i]
+    result = np.full((n_windows, len(FIT_FIELDS), 5), np.nan)
+    misfit = np.full((n_windows, 2), np.nan)
+    dof = np.full((n_windows, n_tau), np.nan)
+    system, whitened, whole = np.empty((size, LANES)), np.empty((size, LANES)), np.empty((size, size + LANES))
+    seen, root, inverse, work = np.empty((6, size)), np.empty((5, size)), np.empty(size), np.empty((2, size))
+    normal, right, squares = np.empty((5, 5)), np.empty(5), np.empty(5)
     for w in range(n_windows):
-        chi2, freedom, n = fit_window(
-            avar[w], white[w], quantization[w], gap_factor[w], columns, to_samples, pairs, ramps, weight, allowed, result[w]
-        )
-        misfit[w, 0], misfit[w, 1] = chi2, freedom
-        if n == 0 or not np.isfinite(chi2):
+        n = observe(avar[w], white[w], quantization[w], gap_factor[w], columns, to_samples, system, seen, inverse)
+        misfit[w, 1] = 0.0
+        if n == 0:
             continue
-        for a in range(columns.shape[1]):
+        chosen = _quick(system, weight, gap_factor[w], normal, right, allowed, squares)
+        chosen = _iterate(system, seen, inverse, tables, allowed, chosen, squares, root, whole, whitened, normal, right)
+        if chosen < 0:
+            continue
+        misfit[w, 0] = _judge(
+            chosen, allowed, squares, system, seen, inverse, tables, root, whole, whitened, normal, right, work, result[w]
+        )
+        misfit[w, 1] = n
+        for a in range(5):
+            misfit[w, 1] -= (chosen & allowed) >> a & 1
             squares[a] = result[w, 0, a] if np.isfinite(result[w, 0, a]) else 0.0
-        cells = degrees_of_freedom(squares, to_samples, columns, white[w], quantization[w], gap_factor[w], diagonal, ramp_diagonal)
-        for i in range(n_tau):
-            if np.isfinite(avar[w, i]):
-                dof[w, i] = cells[i]
+        degrees_of_freedom(squares, avar[w], white[w], quantization[w], gap_factor[w], columns, to_samples, diagonal, dof[w])
     return result, misfit, dof

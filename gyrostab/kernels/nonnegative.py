@@ -1,4 +1,4 @@
-"""Small dense linear algebra: Cholesky factors, and least squares with coefficients that cannot be negative.
+"""Small dense linear algebra: elimination, and least squares with coefficients that cannot be negative.
 
 The non-negative solution is exact: of five terms there are at most 31 subsets, and all are tried.
 """
@@ -8,74 +8,125 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["cholesky", "solve_lower", "solve_nonnegative", "solve_subset", "solve_upper"]
+__all__ = ["back_substitute", "eliminate", "solve_nonnegative", "solve_subset"]
+
+#: Lets the compiler add in another order, which it needs for vector code; the order is the same on every call.
+REORDER = {"reassoc", "contract", "nsz"}
 
 
-@njit(nogil=True, cache=True)
-def cholesky(matrix, n):  # type: ignore[no-untyped-def]
-    """Lower factor in place of the leading n x n block; False when it is not positive definite."""
-    for j in range(n):
-        for i in range(j, n):
-            total = matrix[i, j]
-            for p in range(j):
-                total -= matrix[i, p] * matrix[j, p]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                matrix[j, j] = np.sqrt(total)
-            else:
-                matrix[i, j] = total / matrix[j, j]
+@njit(nogil=True, cache=True, fastmath=REORDER, error_model="numpy")
+def eliminate(system):  # type: ignore[no-untyped-def]
+    """Replace ``[C | Y]`` by ``[U | U^-T Y]`` where ``C = U^T U``; False when C is not positive definite.
+
+    Parameters
+    ----------
+    system : float64 (n, width)
+        The upper triangle of C, n a multiple of 4, and right-hand sides beside it. Four rows at a time are taken out of
+        those below, so that each of these is read and written once for the four.
+    """
+    n, width = system.shape
+    end = np.uint64(width)  # an unsigned index needs no test for a negative one, which would keep loops from vector code
+    for k in range(0, n, 4):
+        start = np.uint64(k)
+        for p in range(k, k + 4):
+            if not system[p, p] > 0.0:
+                return False
+            inverse = 1.0 / np.sqrt(system[p, p])
+            for j in range(start, end):
+                system[p, j] *= inverse
+            for i in range(p + 1, k + 4):
+                share = system[p, i]
+                for j in range(start, end):
+                    system[i, j] -= share * system[p, j]
+        first, second, third, fourth = system[k], system[k + 1], system[k + 2], system[k + 3]
+        for i in range(k + 4, n):
+            a, b, c, d = first[i], second[i], third[i], fourth[i]
+            row = system[i]
+            for j in range(np.uint64(i & -4), end):
+                row[j] -= a * first[j] + b * second[j] + c * third[j] + d * fourth[j]
     return True
 
 
-@njit(nogil=True, cache=True)
-def solve_lower(factor, n, vector):  # type: ignore[no-untyped-def]
-    """Solve ``factor x = vector`` in place."""
-    for i in range(n):
-        total = vector[i]
-        for p in range(i):
-            total -= factor[i, p] * vector[p]
-        vector[i] = total / factor[i, i]
+@njit(nogil=True, cache=True, fastmath=REORDER, error_model="numpy")
+def back_substitute(system, vector):  # type: ignore[no-untyped-def]
+    """Solve ``U x = vector`` in place, U the upper triangle that `eliminate` left."""
+    n = vector.size
+    for back in range(n):
+        i = n - 1 - back
+        row = system[i]
+        total = 0.0
+        for j in range(np.uint64(i + 1), np.uint64(n)):
+            total += row[j] * vector[j]
+        vector[i] = (vector[i] - total) / row[i]
 
 
-@njit(nogil=True, cache=True)
-def solve_upper(factor, n, vector):  # type: ignore[no-untyped-def]
-    """Solve ``factor^T x = vector`` in place."""
-    for i in range(n - 1, -1, -1):
-        total = vector[i]
-        for p in range(i + 1, n):
-            total -= factor[p, i] * vector[p]
-        vector[i] = total / factor[i, i]
-
-
-@njit(nogil=True, cache=True)
-def solve_subset(normal, right, subset, solution):  # type: ignore[no-untyped-def]
-    """Solve the normal equations for the terms in the bit set `subset`; False when they cannot be told apart."""
-    members = np.empty(right.size, np.int64)
+@njit(nogil=True, cache=True, error_model="numpy")
+def _list_members(subset, members):  # type: ignore[no-untyped-def]
     n = 0
-    for a in range(right.size):
-        if subset >> a & 1:
-            members[n] = a
+    for i in range(members.size):
+        if subset >> i & 1:
+            members[n] = i
             n += 1
-    factor = np.empty((n, n))
-    vector = np.empty(n)
-    for i in range(n):
-        vector[i] = right[members[i]]
-        for j in range(n):
-            factor[i, j] = normal[members[i], members[j]]
-        factor[i, i] *= 1.0 + 1e-12
-    if not cholesky(factor, n):
-        return False
-    solve_lower(factor, n, vector)
-    solve_upper(factor, n, vector)
+    return n
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def solve_subset(normal, right, subset, solution, work, members):  # type: ignore[no-untyped-def]
+    """Solve the normal equations for the terms in the bit set `subset`; False when they cannot be told apart.
+
+    Parameters
+    ----------
+    normal : float64 (n, n); right : float64 (n,)
+        Normal equations.
+    subset : int
+        Bit set of the terms.
+    solution : float64 (n,)
+        Overwritten, with zero for the terms outside `subset`.
+    work : float64 (n, n); members : int64 (n,)
+        Scratch.
+    """
+    n = _list_members(subset, members)
     solution[:] = 0.0
-    for i in range(n):
-        solution[members[i]] = vector[i]
+    for i in range(n):  # Cholesky factor and forward solution, row by row
+        for j in range(i):
+            total = normal[members[i], members[j]]
+            for p in range(j):
+                total -= work[i, p] * work[j, p]
+            work[i, j] = total / work[j, j]
+        pivot = normal[members[i], members[i]] * (1.0 + 1e-12)
+        total = right[members[i]]
+        for p in range(i):
+            pivot -= work[i, p] * work[i, p]
+            total -= work[i, p] * solution[members[p]]
+        if not pivot > 0.0:
+            return False
+        work[i, i] = np.sqrt(pivot)
+        solution[members[i]] = total / work[i, i]
+    for i in range(n - 1, -1, -1):
+        for p in range(i + 1, n):
+            solution[members[i]] -= work[p, i] * solution[members[p]]
+        solution[members[i]] /= work[i, i]
     return True
 
 
-@njit(nogil=True, cache=True)
-def solve_nonnegative(normal, right, allowed, solution):  # type: ignore[no-untyped-def]
+@njit(nogil=True, cache=True, error_model="numpy")
+def _optimal(normal, right, allowed, subset, solution):  # type: ignore[no-untyped-def]
+    """Whether the solution for `subset` is not negative, and no other allowed term would improve it (Karush-Kuhn-Tucker)."""
+    for i in range(right.size):
+        if subset >> i & 1:
+            if solution[i] <= 0.0:
+                return False
+        elif allowed >> i & 1:
+            slope = right[i]
+            for j in range(right.size):
+                slope -= normal[i, j] * solution[j]
+            if slope > 0.0:
+                return False
+    return True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def solve_nonnegative(normal, right, allowed, solution, guess=0):  # type: ignore[no-untyped-def]
     """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``; returns the bit set of the terms above zero.
 
     Parameters
@@ -86,23 +137,27 @@ def solve_nonnegative(normal, right, allowed, solution):  # type: ignore[no-unty
         Bit set of the terms that may be used.
     solution : float64 (n,)
         Overwritten with the minimiser.
+    guess : int
+        Bit set that is tried first; if it holds the minimiser, no other is tried.
     """
     n = right.size
-    scale = np.empty(n)
-    scaled = np.empty((n, n))
-    scaled_right = np.empty(n)
+    room, members = np.empty((2 * n + 3, n)), np.empty(n, np.int64)
+    scaled, work, scale, scaled_right, trial = room[:n], room[n : 2 * n], room[2 * n], room[2 * n + 1], room[2 * n + 2]
     for i in range(n):
         scale[i] = 1.0 / np.sqrt(normal[i, i]) if normal[i, i] > 0.0 else 0.0
     for i in range(n):
         scaled_right[i] = right[i] * scale[i]
         for j in range(n):
             scaled[i, j] = normal[i, j] * scale[i] * scale[j]
+    if guess and solve_subset(scaled, scaled_right, guess, trial, work, members) and _optimal(scaled, scaled_right, allowed, guess, trial):
+        for i in range(n):
+            solution[i] = trial[i] * scale[i]
+        return guess
     best = 0.0
     chosen = 0
-    trial = np.empty(n)
     solution[:] = 0.0
     for subset in range(1, 1 << n):
-        if subset & ~allowed or not solve_subset(scaled, scaled_right, subset, trial):
+        if subset & ~allowed or not solve_subset(scaled, scaled_right, subset, trial, work, members):
             continue
         gain = 0.0
         feasible = True

@@ -1,0 +1,108 @@
+"""Upper limits of squared coefficients from single cells, and the quantile of chi-square that they need."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = ["cell_limits", "interpolate_quantile"]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
+    """Quantile of chi-square over its degrees of freedom, by Lagrange's cubic through four nodes of ``nu ln q``."""
+    if not freedom > 0.0:
+        return 0.0
+    position = (np.log(freedom) - start) / step
+    i = min(max(int(position), 1), curve.size - 3)
+    t = position - i
+    if t < -1.0:  # below the table, where the quantile is below the smallest number
+        return 0.0
+    before, here = curve[i - 1], curve[i]
+    after, beyond = curve[i + 1], curve[i + 2]
+    value = -t * (t - 1.0) * (t - 2.0) / 6.0 * before + (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 * here
+    value += -(t + 1.0) * t * (t - 2.0) / 2.0 * after + (t + 1.0) * t * (t - 1.0) / 6.0 * beyond
+    return np.exp(value / freedom)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def interpolate_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
+    """Quantile of chi-square over its degrees of freedom.
+
+    Parameters
+    ----------
+    freedom : float64, any shape
+        Degrees of freedom; not above the last node but two.
+    start, step : float
+        Logarithm of the freedom of the first node, and the distance between nodes.
+    curve : float64 (n_nodes,)
+        ``nu ln q(nu)``, which is smooth from few degrees of freedom to many.
+    """
+    out = np.empty(freedom.shape)
+    flat, values = freedom.ravel(), out.reshape(-1)
+    for i in range(flat.size):
+        values[i] = _quantile(flat[i], start, step, curve)
+    return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _see(columns, white, quantization, squares, seen):  # type: ignore[no-untyped-def]
+    """Allan variance of one cell under the fitted model; per squared coefficient, seen through the gaps, to `seen`."""
+    model = 0.0
+    for a in range(5):
+        seen[a] = columns[a] * (quantization if a == 0 else (white if a == 1 else 1.0))
+        if squares[a] > 0.0:
+            model += seen[a] * squares[a]
+    return model
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def cell_limits(avar, white, quantization, factor, squares, dof, columns, own_dof, most, start, step, curve):  # type: ignore[no-untyped-def]
+    """Upper limit of each squared coefficient from one cell, which cannot be less than the term's own part of it.
+
+    The cell is the one where the fitted model promises the lowest limit, so that its own scatter does not choose it.
+
+    Parameters
+    ----------
+    avar, white, quantization, factor, dof : float64 (n_windows, n_tau)
+        Cells, what the gaps do to them, and their degrees of freedom under the fitted noise.
+    squares : float64 (n_windows, 5)
+        Fitted squared coefficients; NaN counts as zero.
+    columns : float64 (n_tau, 5)
+        Allan variance per squared coefficient.
+    own_dof : float64 (5, n_tau)
+        Degrees of freedom of a cell in which a term is alone; infinite for a ramp, which is bounded by `dof`.
+    most : float
+        Degrees of freedom are not taken above this.
+    start, step, curve
+        As in `interpolate_quantile`.
+
+    Returns
+    -------
+    float64 (n_windows, 5)
+        Infinite where no cell gives a limit.
+    """
+    n_windows, n_tau = avar.shape
+    out = np.full((n_windows, 5), np.inf)
+    whole, seen, lowest = np.empty((n_tau, 5)), np.empty(5), np.empty(5)
+    for i in range(n_tau):
+        for a in range(5):
+            whole[i, a] = _quantile(min(own_dof[a, i], most), start, step, curve)
+    for w in range(n_windows):
+        lowest[:] = np.inf
+        for i in range(n_tau):
+            if not np.isfinite(avar[w, i]):
+                continue
+            model = _see(columns[i], white[w, i], quantization[w, i], squares[w], seen)
+            share = factor[w, i]
+            for a in range(5):
+                quantile = whole[i, a]
+                if a == 4:
+                    quantile = _quantile(min(own_dof[a, i] * share, most, dof[w, i]), start, step, curve)
+                elif share != 1.0:
+                    quantile = _quantile(min(own_dof[a, i] * share, most), start, step, curve)
+                reach = 1.0 / (quantile * seen[a]) if quantile > 0.0 else np.inf
+                if model * reach < lowest[a]:
+                    lowest[a] = model * reach
+                    out[w, a] = avar[w, i] * reach
+    return out
