@@ -212,11 +212,10 @@ def davar_part(log: xr.Dataset, *, part: slice, **options: Any) -> xr.Dataset:
 def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Cells (8, n_windows, n_tau), the last field the degrees of freedom, and means (2, n_windows) of one unit."""
     x = np.ascontiguousarray(x)
-    cells = surface_unit(x, unit)
+    cells, means = surface_unit(x, unit)
     scale = HOUR if unit.angle else 1.0  # angles are in degree, so their slopes in degree per second
     cells[0] *= scale**2
     dof = identify_noise(cells[0], cells[5], cells[6], cells[3], *tables)
-    means = window_means(x, unit)
     means[0] *= scale
     return np.concatenate([cells, dof[None]]), means
 

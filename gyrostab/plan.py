@@ -104,7 +104,9 @@ def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
     """Windows of each unit of work; they depend on the windows alone, not on any chunking."""
     points = unit.window + (1 if unit.angle else 0)
     n_windows = (n_samples - points) // unit.step + 1
-    per_unit = max(8, min((max(4 * unit.window, 2**18) - unit.window) // unit.step, MOST_CELLS // unit.ks.size))
+    # A unit works twice on what its last windows share with the next unit: the longer, the less of that.
+    length = max(4 * unit.window, min(16 * unit.window, 2**20), 2**18)
+    per_unit = max(8, min((length - unit.window) // unit.step, MOST_CELLS // unit.ks.size))
     return [slice(first, min(first + per_unit, n_windows)) for first in range(0, n_windows, per_unit)]
 
 

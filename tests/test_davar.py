@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from gyrostab.davar import davar
 from gyrostab.errors import OptionError, SchemaError
+from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places
+from gyrostab.kernels.vectors import LANES, split_sums
 from gyrostab.log import make_log
 from gyrostab.schema import ESTIMATORS
 from tests.reference import cluster_variance, direct_angle_surface, direct_surface
@@ -91,6 +93,45 @@ class TestAgainstTheDefinition:
         avar, count = direct_surface(x, 4000, 700, list(ks), shifts=list(shifts))
         np.testing.assert_array_equal(result["count"].values[0], count)
         np.testing.assert_allclose(result["avar"].values[0], avar, rtol=1e-12)
+
+
+class TestKernels:
+    @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 200))
+    @settings(max_examples=60, deadline=None)
+    def test_sums_of_several_lags_in_one_pass(self, seed, count, longest):
+        rng = np.random.default_rng(seed)
+        lags, sizes, first = rng.integers(1, 40, count + 2), rng.integers(0, longest, count), int(rng.integers(0, 9))
+        splits = rng.integers(0, sizes + 1)
+        used = lags[2:]
+        theta = np.full(first + longest + 2 * used.max() + LANES, np.nan)  # what no term needs may be anything
+        end = first + (sizes + 2 * used).max()
+        theta[first:end] = rng.standard_normal(end - first)
+        out = np.full(2 * count, 7.0)
+        split_sums(theta, first, count, lags, 2, splits, sizes, out)
+        for i, (k, split, size) in enumerate(zip(used, splits, sizes, strict=True)):
+            m = first + np.arange(size)
+            squares = (theta[m + 2 * k] - 2 * theta[m + k] + theta[m]) ** 2
+            np.testing.assert_allclose(out[[i, count + i]], [squares[:split].sum(), squares[split:].sum()], rtol=1e-12)
+
+    @given(st.integers(0, 2**32 - 1), st.integers(1, 9000), st.sampled_from([0.0, 0.001, 0.3, 0.99, 1.0]))
+    @settings(max_examples=40, deadline=None)
+    def test_integral_and_its_levels(self, seed, n, missing):
+        rng = np.random.default_rng(seed)
+        x = rng.integers(-5, 6, n).astype(np.float64)
+        x[rng.random(n) < missing] = np.nan
+        starts, stops = present_runs(x)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
+        np.testing.assert_array_equal(starts, edges[::2])
+        np.testing.assert_array_equal(stops, edges[1::2])
+        shifts = np.array([0, 0, 1, 4])
+        places, size = pyramid_places(n + 1, np.array([1, 2, 16, 160]), shifts)
+        flat = np.empty(size)
+        largest = integrate(x, 1.0, starts, stops, flat, 4)
+        theta = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(x), x - 1.0, 0.0))])
+        assert largest == np.abs(theta).max()
+        for place, shift in zip(places, shifts, strict=True):
+            want = theta[:: 2**shift]
+            np.testing.assert_array_equal(flat[place : place + want.size], want)
 
 
 class TestAgainstPeers:

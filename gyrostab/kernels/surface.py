@@ -8,8 +8,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.blocks import integrate, integrate_two, needs_two_doubles, present_runs, slide, strict_sums, valid_intervals
+from gyrostab.kernels.blocks import full_counts, grouped_blocks, windows_from_blocks
 from gyrostab.kernels.clusters import cluster_cell, cluster_prefix
+from gyrostab.kernels.integrate import (
+    block_sums,
+    first_present,
+    integrate,
+    integrate_two,
+    needs_two_doubles,
+    present_runs,
+    pyramid_places,
+    thin_pyramid,
+)
+from gyrostab.kernels.intervals import single_blocks, valid_intervals
 from gyrostab.kernels.pairs import strict_gap_factors
 
 __all__ = ["CELL_FIELDS", "NONE", "STRICT", "WEIGHTED", "Unit", "surface_unit", "window_means"]
@@ -17,6 +28,12 @@ __all__ = ["CELL_FIELDS", "NONE", "STRICT", "WEIGHTED", "Unit", "surface_unit", 
 NONE, STRICT, WEIGHTED = 0, 1, 2
 #: Order of the fields of a cell in the array that `surface_unit` returns.
 CELL_FIELDS = ("avar", "count", "coverage", "gap_factor", "estimator", "white_response", "quantization_response")
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# Types that are summed as they are; others become double first.
+_NATIVE = tuple(np.dtype(kind) for kind in (np.float64, np.float32, np.int32, np.int16))
 
 
 class Unit(NamedTuple):
@@ -50,22 +67,45 @@ class Unit(NamedTuple):
 
 
 @njit(nogil=True, cache=True)
-def _bridge_gaps(theta, present, starts, stops, angle, window, step, ks, shifts, counts, full, min_strict, cells):  # type: ignore[no-untyped-def]
-    """Degrees of freedom of the strict cells, and weighted clusters where too few terms are left (rate logs only)."""
-    samples, runs = cluster_prefix(present)
+def _fill(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[no-untyped-def]
+    """Cells from sums of squares; `counts` is empty where nothing is missing."""
+    for j in range(sums.shape[0]):
+        for i in range(ks.size):
+            count = full[j, i] if counts.size == 0 else counts[j, i]
+            divisor = full[j, i] if zero_fill else count
+            span = ks[i] * interval
+            cells[0, j, i] = sums[j, i] / (2.0 * span * span * divisor) if divisor > 0 else np.nan
+            cells[1, j, i] = count
+            cells[2, j, i] = count / full[j, i]
+            cells[3, j, i] = 1.0
+            cells[4, j, i] = STRICT
+            cells[5, j, i] = 1.0
+            cells[6, j, i] = 1.0
+
+
+@njit(nogil=True, cache=True)
+def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, cells):  # type: ignore[no-untyped-def]
+    """Degrees of freedom of the strict cells, as a share of the gap-free ones."""
     for i in range(ks.size):
-        k = ks[i]
-        if window - 2 * k + 1 < 1:
-            continue
         if angle:
             for j in range(counts.shape[0]):
                 cells[3, j, i] = counts[j, i] / full[j, i]
             continue
-        begin, end = valid_intervals(starts, stops, k, angle)
-        cells[3, :, i] = strict_gap_factors(begin, end, counts[:, i], full[:, i], k, shifts[i], window, step)
-        for j in range(counts.shape[0]):
-            if counts[j, i] < min_strict * full[j, i]:
-                cell = cluster_cell(theta, present, samples, runs, j * step, window, k)
+        begin, end = valid_intervals(starts, stops, ks[i], angle)
+        cells[3, :, i] = strict_gap_factors(begin, end, counts[:, i], full[:, i], ks[i], shifts[i], window, step)
+
+
+@njit(nogil=True, cache=True)
+def _bridge_gaps(theta, starts, stops, window, step, ks, poor, cells):  # type: ignore[no-untyped-def]
+    """Weighted clusters where too few terms are left (rate logs only)."""
+    present = np.zeros(theta.size - 1, np.bool_)
+    for r in range(starts.size):
+        present[starts[r] : stops[r]] = True
+    samples, runs = cluster_prefix(present)
+    for i in range(ks.size):
+        for j in range(poor.shape[0]):
+            if poor[j, i]:
+                cell = cluster_cell(theta, present, samples, runs, j * step, window, ks[i])
                 cells[0, j, i] = cell[0]
                 cells[1, j, i] = cell[1]
                 cells[2, j, i] = cell[2]
@@ -75,27 +115,66 @@ def _bridge_gaps(theta, present, starts, stops, angle, window, step, ks, shifts,
                 cells[6, j, i] = cell[4]
 
 
-def _theta(x: NDArray[np.generic], present: NDArray[np.bool_], angle: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
-    """Local angle of the unit, its remainder, and whether the remainder is needed."""
+class _Angle(NamedTuple):
+    """Angle of a unit: every level of thinning in one array, where each begins, the remainders (or nothing), runs of present points."""
+
+    flat: Floats
+    rest: Floats
+    places: Integers
+    points: int
+    starts: Integers
+    stops: Integers
+
+
+def _line_removed(x: NDArray[np.generic], starts: Integers, stops: Integers) -> Floats:
+    """Angle less the line through its first and last present points, zero where it is missing."""
+    first, last = starts[0], stops[-1] - 1
     values = np.asarray(x, dtype=np.float64)
-    if angle:
-        where = np.flatnonzero(present)
-        first, last = where[0], where[-1]
-        slope = (values[last] - values[first]) / max(last - first, 1)
-        line = values[first] + slope * (np.arange(values.size) - first)
-        theta = np.where(present, values - line, 0.0)
-        return theta, theta, False
-    offset = float(np.mean(values) if present.all() else np.mean(values, where=present))
-    if not np.issubdtype(x.dtype, np.floating):
-        offset = float(np.rint(offset))  # integer counts less an integer: every sum is exact
-    theta = integrate(values, present, offset)
-    if needs_two_doubles(theta, values, present):
-        return *integrate_two(values, present, offset), True
-    return theta, theta, False
+    line = values[first] + (values[last] - values[first]) / max(last - first, 1) * (np.arange(values.size) - first)
+    return np.where(np.isfinite(values), values - line, 0.0)
 
 
-def surface_unit(x: NDArray[np.generic], unit: Unit) -> NDArray[np.float64]:
-    """Cells of the windows that start in a stretch of one axis.
+def _angle(x: NDArray[np.generic], unit: Unit, starts: Integers, stops: Integers, offset: float) -> _Angle:
+    """Local angle of the unit, for rates the integral of ``x - offset``."""
+    points = x.size + (0 if unit.angle else 1)
+    places, size = pyramid_places(points, unit.ks, unit.shifts)
+    flat, rest = np.empty(size), np.empty(0)
+    levels = int(unit.shifts.max(initial=0))
+    if unit.angle:
+        flat[:points] = _line_removed(x, starts, stops)
+        thin_pyramid(flat, points, levels, 0, points)
+    elif needs_two_doubles(integrate(x, offset, starts, stops, flat, levels), x):
+        rest = np.empty(size)
+        integrate_two(x, offset, starts, stops, flat[:points], rest[:points])
+        thin_pyramid(flat, points, levels, 0, points)
+        thin_pyramid(rest, points, levels, 0, points)
+    return _Angle(flat, rest, places, points, starts, stops if unit.angle else stops + 1)
+
+
+def _strict_sums(angle: _Angle, unit: Unit, n_windows: int, gaps: bool) -> tuple[Floats, Floats]:
+    """Sums of squared second differences of every window and averaging factor, and numbers of terms (empty where all are there)."""
+    lengths = unit.window - 2 * unit.ks + 1
+    whole = lengths // unit.step
+    rest = lengths - whole * unit.step
+    if angle.rest.size or (unit.angle and angle.starts.size > 1):
+        starts, stops = angle.starts, angle.stops if unit.angle else angle.stops - 1
+        heads, tails, head_counts, tail_counts = single_blocks(
+            angle.flat, angle.rest, angle.places, starts, stops, unit.angle, unit.step, unit.ks, unit.shifts, rest, whole, n_windows
+        )
+    else:
+        heads, tails, head_counts, tail_counts = grouped_blocks(
+            angle.flat, angle.places, angle.starts, angle.stops, unit.step, unit.ks, unit.shifts, rest, whole, n_windows, gaps
+        )
+    sums = windows_from_blocks(heads, tails, whole, n_windows)
+    return sums, windows_from_blocks(head_counts, tail_counts, whole, n_windows) if gaps else np.empty((0, 0))
+
+
+def _native(x: NDArray[np.generic]) -> NDArray[np.generic]:
+    return np.ascontiguousarray(x if x.dtype in _NATIVE else x.astype(np.float64))
+
+
+def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
+    """Cells and means of the windows that start in a stretch of one axis.
 
     Parameters
     ----------
@@ -107,76 +186,71 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> NDArray[np.float64]:
 
     Returns
     -------
-    ndarray (7, n_windows, n_tau)
+    cells : ndarray (7, n_windows, n_tau)
         The fields of `CELL_FIELDS`; the variance is in the square of the rate's unit (for angles: of angle per second).
+    means : ndarray (2, n_windows)
+        As `window_means`.
     """
-    points = unit.window + 1 if unit.angle else unit.window
-    n_windows = (x.size - points) // unit.step + 1
-    cells = np.zeros((len(CELL_FIELDS), n_windows, unit.ks.size))
-    cells[0], cells[5:] = np.nan, np.nan
-    present = np.isfinite(x) if np.issubdtype(x.dtype, np.floating) else np.ones(x.size, dtype=np.bool_)
-    if not present.any():
-        return cells
-    theta, rest, two = _theta(x, present, unit.angle)
-    starts, stops = present_runs(present)
-    sums, counts, full = strict_sums(theta, rest, two, starts, stops, unit.angle, unit.window, unit.step, n_windows, unit.ks, unit.shifts)
-    divisor = full if unit.zero_fill else counts
-    with np.errstate(invalid="ignore", divide="ignore"):
-        cells[0] = sums / (2.0 * unit.ks.astype(np.float64) ** 2 * divisor) / (unit.interval**2 if unit.angle else 1.0)
-        cells[2] = counts / full
-    cells[1] = counts
-    cells[3] = 1.0
-    cells[4] = STRICT
-    cells[5:] = 1.0
-    if not present.all():
-        _bridge_gaps(
-            theta, present, starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, counts, full,
-            0.0 if unit.zero_fill else unit.min_strict, cells,
-        )  # fmt: skip
+    counts_only = np.issubdtype(x.dtype, np.integer)
+    x = _native(x)
+    n_windows = _number_of_windows(x, unit)
+    cells = np.empty((len(CELL_FIELDS), n_windows, unit.ks.size))
+    means, mean, present = _means(x, unit, n_windows)
+    if present == 0:
+        cells[:] = 0.0
+        cells[0], cells[5:] = np.nan, np.nan
+        return cells, means
+    gaps = present < x.size
+    starts, stops = present_runs(x) if gaps else (np.zeros(1, np.int64), np.full(1, x.size))
+    angle = _angle(x, unit, starts, stops, float(np.rint(mean)) if counts_only else mean)  # integers less an integer: every sum is exact
+    sums, counts = _strict_sums(angle, unit, n_windows, gaps)
+    full = full_counts(unit.window, unit.step, n_windows, unit.ks, unit.shifts)
+    _fill(sums, counts, full, unit.zero_fill, unit.ks, unit.interval if unit.angle else 1.0, cells)
+    if gaps:
+        _share_gaps(starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, counts, full, cells)
+        poor = counts < unit.min_strict * full
+        if not unit.zero_fill and not unit.angle and poor.any():
+            _bridge_gaps(angle.flat[: angle.points], starts, stops, unit.window, unit.step, unit.ks, poor, cells)
     if not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
         cells[0][blank] = cells[5][blank] = cells[6][blank] = np.nan
         cells[4][blank] = NONE
         cells[3][blank] = 0.0
-    return cells
+    return cells, means
 
 
-@njit(nogil=True, cache=True)
-def _rate_means(values, window, step, n_windows):  # type: ignore[no-untyped-def]
-    """Means and shares of present samples by block sums, as in `gyrostab.kernels.blocks`."""
-    whole = window // step
-    head_length = window - whole * step
-    n_blocks = n_windows + whole
-    heads, tails = np.zeros(n_blocks), np.zeros(n_blocks)
-    head_counts, tail_counts = np.zeros(n_blocks), np.zeros(n_blocks)
-    offset = 0.0  # the first value present: the sums stay small on a tool that turns
-    for i in range(values.size):
-        if np.isfinite(values[i]):
-            offset = values[i]
-            break
-    for block in range(n_blocks):
-        for i in range(step):
-            m = block * step + i
-            if m < values.size and np.isfinite(values[m]):
-                if i < head_length:
-                    heads[block] += values[m] - offset
-                    head_counts[block] += 1
-                else:
-                    tails[block] += values[m] - offset
-                    tail_counts[block] += 1
-    sums, counts = np.empty(n_windows), np.empty(n_windows)
-    slide(heads + tails, whole, n_windows, sums)
-    slide(head_counts + tail_counts, whole, n_windows, counts)
+def _number_of_windows(x: NDArray[np.generic], unit: Unit) -> int:
+    return int((x.size - unit.window - (1 if unit.angle else 0)) // unit.step + 1)
+
+
+def _means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> tuple[Floats, float, int]:
+    """Means and coverage of the windows, mean of the stretch, number of samples present in it."""
+    if unit.angle:
+        return _angle_means(x, unit, n_windows), np.nan, int(np.isfinite(x).sum())
+    base = first_present(x)
+    if np.isnan(base):
+        return np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)]), np.nan, 0
+    heads, tails = block_sums(x, base, unit.window, unit.step, n_windows)  # less the first sample: small on a tool that turns
+    total, present = heads.sum(axis=0) + tails.sum(axis=0)
+    windows = windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), n_windows)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means = np.stack([base + windows[:, 0] / windows[:, 1], windows[:, 1] / unit.window])
+    return means, base + total / present, int(present)
+
+
+def _angle_means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> Floats:
+    """Slope between the first and last angle present in each window, and the share present."""
     out = np.full((2, n_windows), np.nan)
     for j in range(n_windows):
-        count = counts[j] + head_counts[j + whole]
-        out[1, j] = count / window
-        if count > 0:
-            out[0, j] = offset + (sums[j] + heads[j + whole]) / count
+        part = np.asarray(x[j * unit.step : j * unit.step + unit.window + 1], dtype=np.float64)
+        where = np.flatnonzero(np.isfinite(part))
+        out[1, j] = where.size / part.size
+        if where.size > 1:
+            out[0, j] = (part[where[-1]] - part[where[0]]) / ((where[-1] - where[0]) * unit.interval)
     return out
 
 
-def window_means(x: NDArray[np.generic], unit: Unit) -> NDArray[np.float64]:
+def window_means(x: NDArray[np.generic], unit: Unit) -> Floats:
     """Mean rate and share of present samples of each window of a stretch (arguments as `surface_unit`).
 
     Returns
@@ -184,16 +258,5 @@ def window_means(x: NDArray[np.generic], unit: Unit) -> NDArray[np.float64]:
     ndarray (2, n_windows)
         Mean [unit of the rate; for angles: of angle per second], NaN where nothing is present; share of samples present.
     """
-    values = np.asarray(x, dtype=np.float64)
-    points = unit.window + 1 if unit.angle else unit.window
-    n_windows = (x.size - points) // unit.step + 1
-    if not unit.angle:
-        return np.asarray(_rate_means(values, unit.window, unit.step, n_windows))
-    out = np.full((2, n_windows), np.nan)
-    for j in range(n_windows):
-        part = values[j * unit.step : j * unit.step + points]
-        where = np.flatnonzero(np.isfinite(part))
-        out[1, j] = where.size / points
-        if where.size > 1:
-            out[0, j] = (part[where[-1]] - part[where[0]]) / ((where[-1] - where[0]) * unit.interval)
-    return out
+    x = _native(x)
+    return _means(x, unit, _number_of_windows(x, unit))[0]

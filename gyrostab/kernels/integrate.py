@@ -1,0 +1,238 @@
+"""From samples to the angle: which are present, their sums per block, the integral, and the integral thinned by octaves.
+
+Missing samples never enter an inner loop: a sum that is not finite tells that a stretch has some, and only then are its
+samples looked at one by one. After that everything works on runs of present samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from gyrostab.kernels.vectors import LANES, TOGETHER
+
+__all__ = [
+    "block_sums",
+    "first_present",
+    "integrate",
+    "integrate_two",
+    "needs_two_doubles",
+    "present_runs",
+    "pyramid_places",
+    "thin_pyramid",
+]
+
+# Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
+_FAST = {"reassoc", "contract", "nsz", "arcp"}
+# Samples that are integrated, measured and thinned while they are in the cache.
+_TILE = 4096
+
+
+@njit(nogil=True, cache=True)
+def first_present(x):  # type: ignore[no-untyped-def]
+    """First finite value of `x` as double, NaN where there is none."""
+    for i in range(x.size):
+        if np.isfinite(x[i]):
+            return float(x[i])
+    return np.nan
+
+
+@njit(nogil=True, cache=True, fastmath=_FAST)
+def _sum(x, base):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for i in range(x.size):
+        total += x[i] - base
+    return total
+
+
+@njit(nogil=True, cache=True)
+def _sum_present(x, base):  # type: ignore[no-untyped-def]
+    """Sum of ``x - base`` over finite samples, and their number."""
+    total = _sum(x, base)
+    if np.isfinite(total):
+        return total, x.size
+    total = 0.0
+    count = 0
+    for i in range(x.size):
+        if np.isfinite(x[i]):
+            total += x[i] - base
+            count += 1
+    return total, count
+
+
+@njit(nogil=True, cache=True)
+def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def]
+    """Heads and tails, (n_blocks, 2) each: sum of ``x - base`` over present samples, and their number."""
+    whole = window // step
+    head = window - whole * step
+    heads, tails = np.zeros((n_windows + whole, 2)), np.zeros((n_windows + whole, 2))
+    for block in range(n_windows + whole):
+        a = block * step
+        heads[block, 0], heads[block, 1] = _sum_present(x[a : a + head], base)
+        if block < n_windows + whole - 1:
+            tails[block, 0], tails[block, 1] = _sum_present(x[a + head : a + step], base)
+    return heads, tails
+
+
+@njit(nogil=True, cache=True)
+def present_runs(x):  # type: ignore[no-untyped-def]
+    """First and one-past-last index of every run of finite samples: two int64 arrays."""
+    starts = np.empty(16, np.int64)
+    stops = np.empty(16, np.int64)
+    run = 0
+    inside = False
+    for a in range(0, x.size, 64):
+        part = x[a : a + 64]
+        if inside and np.isfinite(_sum(part, 0.0)):
+            continue
+        for i in range(part.size):
+            if np.isfinite(part[i]) == inside:
+                continue
+            if inside:
+                stops[run] = a + i
+                run += 1
+            else:
+                if run == starts.size:
+                    starts = np.concatenate((starts, np.empty_like(starts)))
+                    stops = np.concatenate((stops, np.empty_like(stops)))
+                starts[run] = a + i
+            inside = not inside
+    if inside:
+        stops[run] = x.size
+        run += 1
+    return starts[:run], stops[:run]
+
+
+@njit(nogil=True, cache=True)
+def _integrate_run(x, offset, total, theta):  # type: ignore[no-untyped-def]
+    """``theta[i] = total + sum(x[: i + 1] - offset)`` of an unbroken run; returns the last."""
+    # Four at a time: one addition instead of four in the chain from sample to sample.
+    whole = x.size - x.size % 4
+    for i in range(0, whole, 4):
+        a, b, c, d = x[i] - offset, x[i + 1] - offset, x[i + 2] - offset, x[i + 3] - offset
+        ab = a + b
+        theta[i] = total + a
+        theta[i + 1] = total + ab
+        theta[i + 2] = total + (ab + c)
+        total += ab + (c + d)
+        theta[i + 3] = total
+    for i in range(whole, x.size):
+        total += x[i] - offset
+        theta[i] = total
+    return total
+
+
+@njit(nogil=True, cache=True)
+def _largest(theta):  # type: ignore[no-untyped-def]
+    """Largest magnitude; doubles without their sign are ordered as the integers of the same bits, which compare faster."""
+    bits = theta.view(np.int64)
+    largest = np.zeros(1, np.int64)
+    for i in range(bits.size):
+        largest[0] = max(largest[0], bits[i] & 0x7FFFFFFFFFFFFFFF)
+    return largest.view(np.float64)[0]
+
+
+@njit(nogil=True, cache=True)
+def thin_pyramid(flat, n_points, levels, a, b):  # type: ignore[no-untyped-def]
+    """Carry the points ``a <= m < b`` of ``flat[:n_points]`` to the levels behind it, each every second point of the one before."""
+    place = 0
+    size = n_points
+    for _ in range(levels):
+        a, b = (a + 1) // 2, (b + 1) // 2
+        source = flat[place + 2 * a : place + min(size, 2 * b) : 2]
+        target = flat[place + size + a : place + size + b]
+        for i in range(target.size):
+            target[i] = source[i]
+        place += size
+        size = (size + 1) // 2
+
+
+@njit(nogil=True, cache=True)
+def integrate(x, offset, starts, stops, flat, levels):  # type: ignore[no-untyped-def]
+    """Angle ``theta[m] = sum(x[:m] - offset)`` over the runs of present samples, gaps adding nothing, and its thinned levels.
+
+    Fills ``flat[: n + 1]`` and the `levels` behind it (see `pyramid_places`); returns the largest magnitude.
+    """
+    theta = flat[: x.size + 1]
+    theta[0] = 0.0
+    total = 0.0
+    largest = 0.0
+    run = 0
+    thin_pyramid(flat, theta.size, levels, 0, 1)
+    for a in range(0, x.size, _TILE):
+        b = min(a + _TILE, x.size)
+        m = a
+        while m < b:
+            if run < starts.size and starts[run] <= m:
+                end = min(stops[run], b)
+                total = _integrate_run(x[m:end], offset, total, theta[m + 1 : end + 1])
+                if end == stops[run]:
+                    run += 1
+            else:
+                end = min(starts[run], b) if run < starts.size else b
+                theta[m + 1 : end + 1] = total
+            m = end
+        largest = max(largest, _largest(theta[a + 1 : b + 1]))
+        thin_pyramid(flat, theta.size, levels, a + 1, b + 1)
+    return largest
+
+
+@njit(nogil=True, cache=True)
+def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyped-def]
+    """The same integral as a sum of two doubles, to about 32 digits (two-sum of Knuth): values and remainders."""
+    total = 0.0
+    rest = 0.0
+    high[:] = 0.0
+    low[:] = 0.0
+    done = 0
+    for r in range(starts.size):
+        high[done + 1 : starts[r] + 1] = total
+        low[done + 1 : starts[r] + 1] = rest
+        for i in range(starts[r], stops[r]):
+            value = x[i] - offset
+            new = total + value
+            part = new - total
+            rest += (total - (new - part)) + (value - part)
+            total = new
+            high[i + 1] = total
+            low[i + 1] = rest
+        done = stops[r]
+    high[done + 1 :] = total
+    low[done + 1 :] = rest
+
+
+@njit(nogil=True, cache=True)
+def needs_two_doubles(largest, x):  # type: ignore[no-untyped-def]
+    """Whether an angle as large as `largest` is too large against the sample-to-sample noise of `x` for doubles to keep the digits."""
+    stride = max(1, x.size // 1000)
+    steps = np.empty(x.size // stride + 1)
+    count = 0
+    for i in range(0, x.size - 1, stride):
+        change = abs(float(x[i + 1]) - float(x[i]))
+        if np.isfinite(change):
+            steps[count] = change
+            count += 1
+    return count > 0 and largest > 1e4 * np.median(steps[:count])
+
+
+@njit(nogil=True, cache=True)
+def pyramid_places(n_points, ks, shifts):  # type: ignore[no-untyped-def]
+    """Where ``theta[:: 2**shift]`` of every shift (not falling) begins in one array, and the size of that array.
+
+    Behind the angles there is room for what `gyrostab.kernels.vectors.split_sums` reads and ignores: it goes as far with
+    the longest of its lags as with the shortest.
+    """
+    apart = 0
+    for i in range(ks.size):
+        apart = max(apart, ks[i] - ks[max(0, i - TOGETHER + 1)])
+    begin = np.zeros(shifts.size, np.int64)
+    place = 0
+    size = n_points
+    shift = 0
+    for i in range(shifts.size):
+        while shift < shifts[i]:
+            place += size
+            size = (size + 1) // 2
+            shift += 1
+        begin[i] = place
+    return begin, place + size + 2 * apart + LANES
