@@ -137,7 +137,8 @@ def regular_log(counts: NDArray[np.int32], missing: NDArray[np.bool_], first: in
     gap = grid_times(start, options.rate, edges).view("datetime64[ns]")
     seconds = np.arange(0, counts.shape[1], max(1, round(options.rate)))
     values = counts * options.scale
-    values[:, missing] = np.nan
+    for gap_begin, gap_stop in edges:
+        values[:, gap_begin:gap_stop] = np.nan
     flags = {"flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8), "flag_meanings": " ".join(GAP_CAUSES)}
     log = xr.Dataset(
         {

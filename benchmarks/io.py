@@ -1,0 +1,134 @@
+"""From files to product, against merely reading the files: NetCDF (int32, zstd), Zarr (int32, blosc) and CSV, with 1 and 2 workers.
+
+    python benchmarks/io.py --hours 12
+
+Prints a Markdown table. Every figure is the best of some runs, each in a process of its own that is warm: kernels compiled, files in
+the cache of the system. Reading is every sample as a double in memory, chunk by chunk, through dask (for CSV: a table of pyarrow).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import make_archive
+
+FORMATS = {"nc": "NetCDF, int32, zstd", "zarr": "Zarr, int32, blosc", "csv": "CSV"}
+TARGETS = {"nc": 2.0, "zarr": 2.0, "csv": 1.5}
+
+
+def main() -> None:
+    """Make the archives, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", type=float, default=12.0, help="length of the NetCDF and Zarr archives")
+    parser.add_argument("--csv-hours", type=float, default=3.0, help="length of the CSV archive")
+    parser.add_argument("--rate", type=float, default=400.0)
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS))
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--measure", nargs=3, metavar=("WHAT", "WORKERS", "FOLDER"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.measure:
+        what, workers, folder = options.measure
+        files = sorted(Path(folder).glob("log-*"))
+        print(json.dumps({"read": read_dask, "parse": read_arrow, "run": run_whole}[what](files, int(workers), options.repeat)))
+        return
+    with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as root:
+        rows = [row for form in options.formats for row in compare(form, Path(root, form), options)]
+    print(
+        f"\n{platform.machine()}, {os.cpu_count()} cores, {options.rate:g} Hz, 3 axes, files of one hour with gaps; best of {options.repeat}\n"
+    )
+    print("| archive | hours | workers | read [s] | Msamples/s | whole run [s] | Msamples/s | run / read | target |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    print(*rows, sep="\n")
+
+
+def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
+    """The rows of one format."""
+    hours = options.csv_hours if form == "csv" else options.hours
+    make_archive.main([str(folder), "--hours", str(hours), "--rate", str(options.rate), "--format", form, "--gaps", "0.02"])
+    samples = 3 * hours * 3600 * options.rate / 1e6
+    rows = []
+    for workers in options.workers:
+        read = measure("parse" if form == "csv" else "read", workers, folder, options)
+        run = measure("run", workers, folder, options)
+        figures = f"{read:.2f} | {samples / read:.1f} | {run:.2f} | {samples / run:.1f} | {run / read:.2f} | <= {TARGETS[form]:g}"
+        rows.append(f"| {FORMATS[form]} | {hours:g} | {workers} | {figures} |")
+    return rows
+
+
+def measure(what: str, workers: int, folder: Path, options: argparse.Namespace) -> float:
+    """Seconds, measured in a process of its own."""
+    command = [sys.executable, __file__, "--repeat", str(options.repeat), "--measure", what, str(workers), str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return float(json.loads(done.stdout.splitlines()[-1]))
+
+
+def best(work: object, repeat: int) -> float:
+    """Seconds of the fastest of some runs."""
+    seconds = []
+    for _ in range(repeat):
+        begun = time.perf_counter()
+        work()  # type: ignore[operator]
+        seconds.append(time.perf_counter() - begun)
+    return min(seconds)
+
+
+def read_dask(files: list[Path], workers: int, repeat: int) -> float:
+    """Every chunk of every file as doubles."""
+    import dask
+
+    from gyrostab.export import open_log
+
+    def work() -> None:
+        logs = [open_log(file) for file in files]
+        blocks = [log.rate.data.map_blocks(lambda block: block[:, -1:], chunks=(1, 1)) for log in logs]
+        with dask.config.set(scheduler="threads", num_workers=workers):
+            dask.compute(*blocks)
+        for log in logs:
+            log.close()
+
+    return best(work, repeat)
+
+
+def read_arrow(files: list[Path], workers: int, repeat: int) -> float:
+    """Every file as a table of pyarrow."""
+    import pyarrow
+    from pyarrow import csv
+
+    pyarrow.set_cpu_count(workers)
+
+    def work() -> None:
+        for file in files:
+            csv.read_csv(file)
+
+    return best(work, repeat)
+
+
+def run_whole(files: list[Path], workers: int, repeat: int) -> float:
+    """The command ``gyrostab run``, after a first one on the first file."""
+    from gyrostab.cli import main as command
+
+    with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as folder:
+        options = ["-o", f"{folder}/product.nc", "--window", "10min", "--step", "1min", "--workers", str(workers)]
+
+        def work(names: list[Path]) -> None:
+            code = command(["run", *map(str, names), *options, "--overwrite", "--quiet-progress"])
+            if code:
+                raise SystemExit(code)
+
+        work(files[:1])
+        return best(lambda: work(files), repeat)
+
+
+if __name__ == "__main__":
+    main()
