@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.schema import signal_name
 from gyrostab.timegrid import TimeGridIndex, first_stamp, grid_times
 
-__all__ = ["Piece", "Source", "log_span", "runs_of", "source_of"]
+__all__ = ["Piece", "Source", "Stretch", "log_span", "read_stretches", "runs_of", "source_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +31,9 @@ class Source:
         """Stamp of the last sample [ns since 1970]."""
         return int(grid_times(self.start, self.rate, self.size - 1))
 
-    def values(self, begin: int, end: int) -> NDArray[np.float64]:
-        """The signal from sample `begin` to `end` (axis, sample), NaN beyond the ends of the log."""
-        out = np.full((self.log.sizes["axis"], end - begin), np.nan)
-        low, high = max(begin, 0), min(end, self.size)
-        if low < high:
-            part = self.log[signal_name(self.log)].data[:, low:high]
-            out[:, low - begin : high - begin] = part if isinstance(part, np.ndarray) else part.compute(scheduler="synchronous")
-        return out
+
+#: A log, and the samples at which a stretch of it begins and ends.
+Stretch = tuple[Source, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +75,23 @@ class Piece:
         samples = np.asarray(samples, dtype=np.int64)
         which = np.clip(np.searchsorted(self.runs[:, 1], samples, side="right") - 1, 0, len(self.runs) - 1)
         return np.asarray(self.runs[which, 0] + samples - self.runs[which, 1])
+
+
+def read_stretches(wanted: Iterable[Stretch]) -> dict[Stretch, NDArray[np.float64]]:
+    """The signals of stretches (axis, sample), read together; NaN beyond the ends of a log."""
+    import dask
+
+    places = list(dict.fromkeys(wanted))
+    lazy = [
+        source.log[signal_name(source.log)].data[:, min(max(begin, 0), source.size) : max(min(end, source.size), 0)]
+        for source, begin, end in places
+    ]
+    found: dict[Stretch, NDArray[np.float64]] = {}
+    for (source, begin, end), values in zip(places, dask.compute(*lazy, scheduler="threads"), strict=True):
+        low = min(max(begin, 0), source.size)
+        found[source, begin, end] = whole = np.full((values.shape[0], end - begin), np.nan)
+        whole[:, low - begin : low - begin + values.shape[1]] = values
+    return found
 
 
 def source_of(log: xr.Dataset, name: str) -> Source:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.gaps import duration, stamp_text
-from gyrostab.join.grid import Piece, Source, runs_of
+from gyrostab.join.grid import Piece, Source, Stretch, read_stretches, runs_of
 from gyrostab.join.notes import first_few, some
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.timegrid import grid_index, grid_times
@@ -31,7 +33,8 @@ _COMPARED = 2**13  # samples at each end of an overlap whose values are compared
 _PROBED = 64  # of them, so many are looked at for a displacement
 _SURE = 32  # common samples that it takes to see a displacement
 _SAME = 0.9  # share of the compared samples that must be alike; a copy may have been damaged
-_Cache = dict[tuple[int, int, int], NDArray[np.float64]]
+_BATCH = 50  # logs whose overlaps are read at once
+_Cache = dict[Stretch, NDArray[np.float64]]
 _STEP, _RESTART = GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart")
 
 
@@ -48,12 +51,12 @@ class _Match:
         return self.common >= 2 and self.same >= _SAME * self.common
 
 
-def _compare(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[int, int]:
-    """Samples (last dimension) at which both have a number, and those at which all numbers are the same."""
+def _compare(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
+    """Number of samples (last dimension) at which both have a number on some axis (first), and at which all numbers are the same."""
     known = np.isfinite(held) & np.isfinite(new)
     told = known.any(axis=0)
     same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~known).all(axis=0) & told
-    return int(told.sum()), int(same.sum())
+    return told.sum(axis=-1), same.sum(axis=-1)
 
 
 def _best(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
@@ -63,33 +66,48 @@ def _best(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
     if here.alike or here.common < _SURE:
         return here
     probe = np.flatnonzero(np.isfinite(new).any(axis=0))[:_PROBED]
-    for shift in sorted(range(-REACH, REACH + 1), key=abs):
-        common, same = _compare(held[:, REACH + shift + probe], new[:, probe])
-        if common >= _SURE and same >= _SAME * common:
-            there = _Match(*_compare(held[:, REACH + shift : REACH + shift + size], new), shift)
-            if there.alike and there.common >= _SURE:
-                return there
+    shifts = np.array(sorted(range(-REACH, REACH + 1), key=abs))
+    common, same = _compare(held[:, REACH + shifts[:, None] + probe], new[:, None, probe])
+    for shift in shifts[(common >= _SURE) & (same >= _SAME * common)].tolist():
+        there = _Match(*_compare(held[:, REACH + shift : REACH + shift + size], new), shift)
+        if there.alike and there.common >= _SURE:
+            return there
     return here
+
+
+def _lag(held: Source, new: Source) -> int:
+    """Sample of `held` at which `new` begins, by the clock."""
+    return int(np.rint(grid_index(held.start, held.rate, new.start)))
+
+
+def _stretches(held: Source, new: Source, lag: int) -> list[tuple[Stretch, Stretch]]:
+    """The ends of the overlap in both logs, to be compared: the earlier with some more samples on either side."""
+    low, high = max(lag, 0), min(lag + new.size, held.size)
+    if high <= low:
+        return []
+    ends = dict.fromkeys([(low, min(high, low + _COMPARED)), (max(low, high - _COMPARED), high)])
+    return [((held, begin - REACH, end + REACH), (new, begin - lag, end - lag)) for begin, end in ends]
+
+
+def _neighbours(sources: Sequence[Source]) -> _Cache:
+    """What it takes to compare each log with the next, read at once."""
+    pairs = [pair for held, new in pairwise(sources) if held.end >= new.start for pair in _stretches(held, new, _lag(held, new))]
+    return read_stretches(one for pair in pairs for one in pair)
 
 
 def _match(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
     """Compare two logs where the clock says that both have samples: sample 0 of `new` at sample `lag` of `held`."""
-
-    def values(source: Source, begin: int, end: int) -> NDArray[np.float64]:
-        key = (id(source), begin, end)
-        if key not in cache:
-            cache[key] = source.values(begin, end)
-        return cache[key]
-
     axes = [str(axis) for axis in held.log["axis"].values if axis in new.log["axis"].values]
-    low, high = max(lag, 0), min(lag + new.size, held.size)
-    if not axes or high <= low:
+    pairs = _stretches(held, new, lag)
+    if not axes or not pairs:
         return _Match(0, 0, 0)
     rows_held, rows_new = ([list(source.log["axis"].values).index(axis) for axis in axes] for source in (held, new))
     found: list[_Match] = []
-    for begin, end in {(low, min(high, low + _COMPARED)), (max(low, high - _COMPARED), high)}:
-        there = values(held, begin - REACH, end + REACH)[rows_held]
-        found.append(_best(there, values(new, begin - lag, end - lag)[rows_new]))
+    for there, here in pairs:
+        if found and found[0].common >= _COMPARED // 2 and found[0].same < 0.5 * found[0].common:
+            break  # no copy, whatever its end is like
+        cache.update(read_stretches(one for one in (there, here) if one not in cache))
+        found.append(_best(cache[there][rows_held], cache[here][rows_new]))
     surest = max(found, key=lambda match: (match.alike, match.same))
     return _Match(sum(match.common for match in found), sum(match.same for match in found), surest.shift)
 
@@ -112,19 +130,19 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Piece
         Sentences on logs between the samples of the grid, on overlaps and on steps of the clock.
     """
     rate = sources[0].rate
-    cache: _Cache = {}
     pieces: list[Piece] = []
     overlaps: list[str] = []
     breaks: list[str] = []
-    for source in sources:
+    cache: _Cache = {}
+    for number, source in enumerate(sources):
+        if number % _BATCH == 0:
+            cache = _neighbours(sources[max(number - 1, 0) : number + _BATCH])
         piece, match = _next(pieces, source, rate, max_gap, cache)
         if match is not None:
             overlaps.append(_overlap_note(piece, *match, rate))
         elif piece.cause >= 0:
             breaks.append(_break_note(pieces, piece))
         pieces.append(piece)
-        for key in [key for key in cache if len(cache) > 512]:
-            del cache[key]
     notes = [
         *_grid_notes(pieces, rate),
         *first_few(breaks, "steps of the clock are in the table of gaps"),
@@ -150,7 +168,7 @@ def _next(pieces: list[Piece], source: Source, rate: float, max_gap: float, cach
     for held in reversed(pieces):
         if held.source.end < source.start:
             continue
-        lag = int(np.rint(grid_index(held.source.start, held.source.rate, source.start)))
+        lag = _lag(held.source, source)
         match = _match(held.source, source, lag, cache)
         if match.alike:
             first = int(held.on_grid(lag + match.shift))
