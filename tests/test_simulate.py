@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import tomllib
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +25,10 @@ from gyrostab.schema import check_log
 from gyrostab.simulate import combine, drivers, read_model, simulate
 from gyrostab.simulate import environment as env
 from gyrostab.simulate.losses import gaps, losses, power_cuts
+from gyrostab.simulate.model import PROFILES
 from gyrostab.timegrid import time_coordinate
+
+from .conftest import ROOT
 
 NOISE = {"Q": 0.06, "N": 0.006, "B": 0.03, "K": 0.05, "z": {"N": 0.004, "R": 0.3}}
 WORLD = [
@@ -416,3 +420,47 @@ def test_command_explains_a_wrong_model(tmp_path, capsys):
     assert "lacks the parameter 'sensitivity'" in said
     assert "Traceback" not in said
     assert not (tmp_path / "log.nc").exists()
+
+
+# ----------------------------------------------------------------------------------------------------------- shipped models
+
+MODELS = sorted((ROOT / "data" / "models").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", MODELS, ids=lambda path: path.stem)
+def test_shipped_models_make_logs(path):
+    log = simulate(path)
+    check_log(log)
+    values = log.rate.isel(time=slice(0, 500)).values
+    assert np.isfinite(values).all()
+    assert (values.std(axis=1) > 0).all()
+
+
+def test_shipped_models_are_all_there():
+    assert {"p16_vibration", "l13_vibration", "l13_temperature", "mwd_24h"} <= {path.stem for path in MODELS}
+
+
+def test_p16_has_its_timeline():
+    log = simulate(ROOT / "data" / "models" / "p16_vibration.toml")
+    assert log.attrs["sampling_rate_hz"] == 400
+    assert log.sizes["time"] == 930 * 400
+    assert gap_table(log)[["seconds", "samples"]].values.tolist() == [[18.0, 7200]]
+    shaken = log.vibration.values > 1
+    assert (np.flatnonzero(shaken)[[0, -1]] == [330, 629]).all()
+    x = log.rate.sel(axis="x").values.reshape(93, 4000)
+    assert np.nanstd(x[33:43]) > 3 * np.nanstd(x[:33])
+
+
+def test_the_model_in_the_guide_is_a_model():
+    text = (ROOT / "docs" / "simulate.md").read_text(encoding="utf-8")
+    table = tomllib.loads(text.split("```toml\n")[1].split("```")[0])
+    made = read_model(table)
+    assert made.log["oversampling"] == 1
+    with pytest.raises(SchemaError, match="needs the channel 'temperature'"):
+        simulate(table)
+
+
+def test_the_guide_lists_every_profile():
+    text = (ROOT / "docs" / "simulate.md").read_text(encoding="utf-8")
+    for name in PROFILES:
+        assert f"`{name}`" in text
