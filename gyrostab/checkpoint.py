@@ -208,7 +208,9 @@ def _lazily(blocks: Sequence[Block], name: str) -> Any:
         return np.concatenate(pieces, axis=along)
 
     chunks = da.core.normalize_chunks([sizes.get(dim, size) for dim, size in dims], shape=tuple(shape))
-    return da.map_blocks(read, chunks=chunks, dtype=np.dtype(described["dtype"]), meta=np.empty((0,) * len(shape), described["dtype"]))
+    dtype = np.dtype(described["dtype"])
+    label = f"{blocks[0].header['job']}-{name}"  # without it dask would hash all that `read` knows
+    return da.map_blocks(read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label)
 
 
 def _to_json(attrs: Mapping[Any, Any]) -> dict[str, Any]:

@@ -362,15 +362,14 @@ def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
     assert call(log, "-o", output) == 0
 
 
-def test_killed_before_every_change_of_the_disk_and_at_random(log, whole, tmp_path):
+def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path):
     seed = random.SystemRandom().randrange(10**6)
     print(f"seed {seed}")
-    command = [sys.executable, "-m", "tests.crashing", str(tmp_path), str(log), str(seed), "9"]
+    command = [sys.executable, "-m", "tests.crashing", str(tmp_path), str(log), str(seed), "8", "4"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=250, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     print(result)
     assert result["wrong"] == []
     assert result["calls"] > 3 * PARTS
-    assert result["kills"] > 0
-    assert (tmp_path / "whole.nc").read_bytes() == whole
+    assert result["kills"] >= 8
