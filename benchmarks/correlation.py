@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="page to put the tables into; printed only when not given")
     chosen = parser.parse_args()
     with Pool() as pool:
-        for name, table in {"claims": claims, "power": power, "intervals": intervals}.items():
+        for name, table in {"claims": claims, "intervals": intervals, "power": power}.items():
             text = "\n".join(table(pool.map, chosen.records))
             print(f"{name}\n{text}\n", flush=True)
             if chosen.output:
@@ -120,9 +120,7 @@ def main() -> None:
                 between = re.compile(f"(?<=<!-- {name} -->\n).*?(?=<!-- end of {name} -->)", re.DOTALL)
                 page, places = between.subn(lambda _, text=text: f"{text}\n", page)
                 if places != 1:
-                    raise SystemExit(
-                        f"{chosen.output}: it has no place for the table {name!r}: put <!-- {name} --> and <!-- end of {name} -->"
-                    )
+                    raise SystemExit(f"{chosen.output}: put <!-- {name} --> and <!-- end of {name} --> where the table goes")
                 chosen.output.write_text(page, encoding="utf-8")
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gyrostab.confidence import confidence_interval as confidence_interval
     from gyrostab.correlate import correlate as correlate
+    from gyrostab.correlate import correlation_rows as correlation_rows
     from gyrostab.davar import davar as davar
     from gyrostab.export import open_log as open_log
     from gyrostab.export import open_product as open_product
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 _HOME = {
     "confidence_interval": "confidence",
     "correlate": "correlate",
+    "correlation_rows": "correlate",
     "davar": "davar",
     "fit_noise": "fit",
     "gap_table": "regularise",
@@ -81,6 +83,7 @@ __all__ = [
     "__version__",
     "confidence_interval",
     "correlate",
+    "correlation_rows",
     "davar",
     "fit_noise",
     "gap_table",

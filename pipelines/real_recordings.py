@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 import gyrostab
-from gyrostab.errors import GyrostabError
 from gyrostab.units import parse_unit
 
 ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
@@ -33,8 +32,7 @@ def pick(value, log, product):
 def examine(entry, file):
     """Go from the log to a product on disk and back, and compute every number that the text speaks of."""
     log = gyrostab.regularise(gyrostab.read_log(entry["files"], **entry["read"]))
-    gyrostab.to_netcdf(gyrostab.fit_noise(gyrostab.davar(log, **entry["davar"])), file)
-    product = gyrostab.open_product(file).load()
+    product = gyrostab.open_product(gyrostab.to_netcdf(gyrostab.fit_noise(gyrostab.davar(log, **entry["davar"])), file)).load()
     found = {"hertz": log.attrs["sampling_rate_hz"], "minutes": np.ptp(log["time"].values) / np.timedelta64(1, "m")}
     found["missing"] = float(log["rate"].isnull().mean())
     for name, value in entry["values"].items():
@@ -48,7 +46,7 @@ def refusal(entry):
     """Tell what gyrostab answers when it is told nothing about the log."""
     try:
         return f"{gyrostab.read_log(entry['files']).sizes['row']} rows"
-    except GyrostabError as error:
+    except gyrostab.errors.GyrostabError as error:
         return str(error)
 
 
@@ -62,19 +60,21 @@ def command(entry):
 
 
 def describe(name, entry, folder):
-    """Process one recording; a row of the table and a section of the page."""
+    """Process one recording; a row of the table, a section of the page, and what follows temperature."""
     log, product, found = examine(entry, Path(folder, f"{name}.nc"))
     notes = "".join(f"- {note}\n" for note in log.attrs["notes"] if not any(words in note for words in PLAN["page"]["usual"]))
     if "figure" in entry:
         gyrostab.plot_davar(product, axis=entry["figure"]).savefig(ROOT / "docs" / "figures" / f"{name}.png", dpi=70)
     about = {**entry, **entry["davar"], **found, "name": name, "axes": ", ".join(log["axis"].values), "gaps": log.sizes["gap"]}
     about |= {"text": entry["text"].format_map(found | {"refusal": refusal(entry)}), "command": command(entry), "notes": notes}
-    return PLAN["page"]["row"].format_map(about), PLAN["page"]["section"].format_map(about)
+    windows = [gyrostab.fit_noise(gyrostab.davar(log, **entry["follow"]))] if "follow" in entry else []
+    cells = [row for made in windows for row in gyrostab.correlation_rows(gyrostab.correlate(made, variables="window_mean"))[::2]]
+    followed = "".join(f"| {' | '.join([name, *map(row.get, PLAN['page']['follow'])])} |\n" for row in cells)
+    return PLAN["page"]["row"].format_map(about), PLAN["page"]["section"].format_map(about), followed
 
 
 if __name__ == "__main__":
     os.chdir(os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings"))
     with tempfile.TemporaryDirectory() as folder:
-        rows, sections = zip(*[describe(name, entry, folder) for name, entry in PLAN["recording"].items()], strict=True)
-    page = PLAN["page"]["head"].format(rows="\n".join(rows), sections="\n".join(sections))
-    (ROOT / "docs" / "real-recordings.md").write_text(page, encoding="utf-8")
+        parts = zip(*[describe(name, entry, folder) for name, entry in PLAN["recording"].items()], strict=True)
+    (ROOT / "docs" / "real-recordings.md").write_text(PLAN["page"]["head"].format(*map("".join, parts)), encoding="utf-8")

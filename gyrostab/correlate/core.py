@@ -228,7 +228,7 @@ def _fit(frame: _Frame | None, series: Array, driver: Driver, others: list[Array
             entries.append(_empty(limits | {"too_few"}, windows=frame.windows.size))
             continue
         entry = _sensitivity(laws, row, x, lags, level) | {"limits": set(limits), "windows": frame.windows.size}
-        best, column = entry["best"], x[:, entry["best"]]
+        column = x[:, entry["best"]]
         entry |= {
             "correlation": _partial(row, column, np.ones((row.size, 1))),
             "partial_time": _partial(row, column, timed),
