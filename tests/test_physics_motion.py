@@ -267,6 +267,11 @@ def test_lines_lock_to_a_changing_rotation():
         np.testing.assert_allclose(rates[row], wave.reshape(-1, factor).mean(axis=1), atol=3e-4)
 
 
+def test_a_part_of_a_line_is_refused():
+    with pytest.raises(OptionError, match="'harmonics': 2.5 is not a whole number of lines"):
+        make_effect({"name": "rotation_line", "amplitude": 1, "harmonics": 2.5})
+
+
 def test_a_pump_is_another_channel():
     strokes = env.rotation([[0, 720.0]], duration=100, accelerations=False)[["rotation_rate"]]
     strokes = strokes.rename(rotation_rate="pump", time_rotation_rate="time_pump")
@@ -382,6 +387,9 @@ def test_earth_rate_and_gravity_share_the_frame_of_the_tool():
 def test_axes_of_other_names_say_where_they_look():
     with pytest.raises(OptionError, match="axis 'north' is not x, y or z; say where it looks with off and around"):
         run(make_effect({"name": "earth_rate", "latitude": 45}), size=2, axes=("north",), drivers={"rotation_rate": 0.0})
+    across = make_effect({"name": "earth_rate", "latitude": 30, "around": [0, 180]})
+    seen = run(across, size=1, axes=("a", "b"), drivers={"rotation_rate": 0.0})[:, 0]
+    np.testing.assert_allclose(seen, 15.041067 * np.array([0.8660254, -0.8660254]), rtol=1e-6)
     effect = make_effect({"name": "earth_rate", "latitude": 30, "off": [90, 0, 45], "around": [0, 0, 0]})
     seen = run(effect, size=1, axes=("a", "b", "c"), drivers={"rotation_rate": 0.0})[:, 0]
     np.testing.assert_allclose(seen, 15.041067 * np.array([0.8660254, -0.5, (0.8660254 - 0.5) / math.sqrt(2)]), rtol=1e-6)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
 from gyrostab.physics.phase import TURN, fold, line_density, turn_means, turns_of_samples, turns_of_windows
 from gyrostab.units import INNER
@@ -142,6 +143,11 @@ class RotationLine(Effect):
     harmonics: float = parameter("1", "number of lines", default=1.0, low=1.0, high=100.0)
     rolloff: float = parameter("1", "the k-th line is k^-rolloff of the first", default=1.0, low=-5.0, high=5.0)
     phase: tuple[float, ...] = parameter("deg", "phase of the first line at the start", default=(), low=-1e6, high=1e6, many=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.harmonics != int(self.harmonics):
+            raise OptionError(f"effect {self.name!r}, parameter 'harmonics': {self.harmonics:g} is not a whole number of lines; give one")
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Turns of the channel so far."""

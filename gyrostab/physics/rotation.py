@@ -210,8 +210,9 @@ class EarthRate(Effect):
 
     def _directions(self, axes: tuple[str, ...]) -> tuple[Array, Array]:
         """Angles of the axes from the tool's axis and around it [radian]."""
-        if self.off or self.around:
-            return np.radians(self.each("off", axes)), np.radians(self.each("around", axes))
+        if self.off or self.around:  # across the tool unless it is said how far off
+            off = self.each("off", axes) if self.off else np.full(len(axes), 90.0)
+            return np.radians(off), np.radians(self.each("around", axes))
         known = {"x": (90.0, 0.0), "y": (90.0, 90.0), "z": (0.0, 0.0)}
         for axis in axes:
             if axis[-1:].lower() not in known:
@@ -261,8 +262,9 @@ class RealMotion(Effect):
 
     ``w_a = d_a (sway(t) + spin w(t) + d/dt (c_x a_x + c_y a_y + c_z a_z))``: d_a is the share of each axis (a direction); sway is the
     velocity of an oscillator of stated frequency and quality shaken by white noise; w the rotation rate; c the tilt per acceleration,
-    whose change in a sample is the rotation in it. What comes first in the model comes first in `true`, which misalignment,
-    scale_factor and dead zone see.
+    whose change in a sample is the rotation in it. All of it is true rate, which misalignment, scale_factor and dead_zone see. The
+    turning of the tool itself is in the log without this effect where the channel ``rotation_rate`` names the axis in its attribute
+    ``rotation_axis``; `spin` is for what another direction sees of it.
 
     *DAVAR*: bump of the sway at 0.371 / f without a floor at long times; the turning as it is. *Window mean*: the turning; sway and
     tilt leave nothing, because the angle stays bounded. *Spectrum*: a peak of width f / Q; tilt has f^2 times that of the

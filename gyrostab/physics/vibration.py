@@ -141,10 +141,10 @@ class AliasedVibration(Effect):
     sinc(f / fs), because they are drawn from the process in continuous time, not because it is put in. Where the model makes the
     instrument sample faster than the log, this is about the instrument, and the logger's own filter decides the rest.
 
-    *DAVAR*: point samples raise sigma at all averaging times, like N, where the band folds onto zero frequency (the 700 to 800 Hz of Wang et al. 2016
-    at 400 Hz fills 0 to 100 Hz: 8 times at 2.5 ms, 19 times from 40 ms on with 50 deg/h and N = 0.003); integrate and dump has its
-    zeros there and raises short times only, like Q (1.3, 1.4, 1.1 times at 2.5, 10, 40 ms). *Window mean*: nothing, and no bias.
-    *Spectrum*: the folded band. *Axes*: one rigid motion, with a factor for each axis.
+    *DAVAR*: point samples raise sigma at all averaging times, like N, where the band folds onto zero frequency (the 700 to 800 Hz of
+    Wang et al. 2016 at 400 Hz fills 0 to 100 Hz: 8 times at 2.5 ms, 19 times from 40 ms on with 50 deg/h and N = 0.0031); integrate and
+    dump has its zeros there and raises short times only, like Q (1.3, 1.4, 1.1 times at 2.5, 10, 40 ms). *Window mean*: nothing, and no
+    bias. *Spectrum*: the folded band. *Axes*: one rigid motion, with a factor for each axis.
 
     Confused with vibration_noise (flat, no cross-spectrum), with Q (not tied to vibration) and spikes (heavy tails). What separates
     them is the edge of the folded band, coherence of the axes, and another sampling rate, at which the band folds elsewhere.
