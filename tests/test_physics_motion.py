@@ -268,7 +268,7 @@ def test_lines_lock_to_a_changing_rotation():
 
 
 def test_a_part_of_a_line_is_refused():
-    with pytest.raises(OptionError, match="'harmonics': 2.5 is not a whole number of lines"):
+    with pytest.raises(OptionError, match=r"'harmonics': 2\.5 is not a whole number of lines"):
         make_effect({"name": "rotation_line", "amplitude": 1, "harmonics": 2.5})
 
 
