@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 
 def direct_surface(
@@ -62,3 +65,60 @@ def cluster_variance(x: NDArray[np.float64], k: int, stride: int) -> tuple[float
         weight += n1 * n2
         count += 1
     return total / weight if weight else np.nan, count
+
+
+def fit_window_plainly(
+    y: NDArray[np.float64], white: NDArray[np.float64], quantization: NDArray[np.float64], factor: NDArray[np.float64], tables: Any
+) -> dict[str, NDArray[np.float64]]:
+    """Iterated non-negative generalised least squares of one window with numpy's and scipy's solvers, without any thrift.
+
+    Per term the squared coefficient, its standard error, its estimate free of sign, and the variance of that without the
+    term, its growth with the term and with the square of the term; chi-square. `tables` are those of `gyrostab.fit`.
+    """
+    ok = np.isfinite(y) & (y > 0) & (factor > 0)
+    y, white, quantization, factor = y[ok], white[ok], quantization[ok], factor[ok]
+    bare, weight = tables.columns[ok], tables.weight[ok] * factor
+    pairs, ramps = tables.pairs[:, :, ok][..., ok], tables.ramps[:, ok][..., ok]
+    design = bare * np.stack([quantization, white, *np.ones((3, y.size))], axis=1)
+    excess = np.maximum(quantization - 1, 0) * bare[:, 0] / bare[:, 1]
+
+    def covariance(s: NDArray[np.float64]) -> NDArray[np.float64]:
+        ones = np.ones(y.size)
+        amounts = np.stack([s[0] * np.minimum(quantization, 1), s[1] * white + s[0] * excess, s[2] * ones, s[3] * ones])
+        roots = np.sqrt(amounts * tables.to_samples[:4, None])
+        outer = roots[:, :, None] * roots[:, None, :]
+        total = np.einsum("aij,bij,abij->ij", outer, outer, pairs)
+        total += s[4] * tables.to_samples[4] * np.einsum("aij,aij->ij", outer, ramps)
+        return total / np.maximum.outer(factor, factor)
+
+    def solve(whitener: NDArray[np.float64]) -> NDArray[np.float64]:
+        columns = whitener @ design
+        scale = np.linalg.norm(columns, axis=0)
+        return nnls(columns / scale, whitener @ y, maxiter=1000)[0] / scale
+
+    squares = solve(np.diag(np.sqrt(weight) / y))
+    for _ in range(6):
+        previous = squares
+        spread = covariance(squares)
+        whitener = np.linalg.inv(np.linalg.cholesky(spread + np.diag(1e-7 * np.diag(spread) + 1e-16 * y**2)))
+        squares = solve(whitener)
+        if (abs(squares - previous) <= 1e-4 * previous).all():
+            break
+    rows = np.empty((5, 6))
+    for a in range(5):
+        members = np.flatnonzero((squares > 0) | (np.arange(5) == a))
+        columns = whitener @ design[:, members]
+        scale = np.linalg.norm(columns, axis=0)
+        estimator = (np.linalg.pinv(columns / scale) / scale[:, None] @ whitener)[list(members).index(a)]
+        trial = np.where(np.arange(5) == a, 0.0, squares)
+        cell, stand_in = {0: (0, 1), 2: (-1, 3), 4: (-1, 3)}.get(a, (0, None))
+        if stand_in is not None:
+            trial[stand_in] += squares[a] * design[cell, a] / design[cell, stand_in]
+        unit = np.eye(5)[a]
+        null, both, own = (estimator @ covariance(s) @ estimator for s in (trial, trial + unit, unit))
+        place = list(members).index(a)
+        error = np.sqrt(np.linalg.inv((columns / scale).T @ (columns / scale))[place, place]) / scale[place]
+        rows[a] = squares[a], error, estimator @ y, null, both - null - own, own
+    names = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square")
+    out = dict(zip(names, rows.T, strict=True))
+    return {**out, "chi2": np.asarray(np.sum((whitener @ (y - design @ squares)) ** 2))}

@@ -6,18 +6,25 @@ import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
 
+from gyrostab import fit
 from gyrostab.confidence import confidence_interval
 from gyrostab.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.fit import fit_noise
 from gyrostab.kernels.covariance import pair_products
+from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
+from gyrostab.kernels.limits import interpolate_quantile
 from gyrostab.kernels.nonnegative import solve_nonnegative
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.log import make_log
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import OBSERVABLE
 from tests.noise_records import flicker, lose, quantization, random_walk, white
+from tests.reference import fit_window_plainly
 
 RATE = 100.0
 
@@ -243,6 +250,67 @@ def test_nonnegative_solution_beats_every_other_point():
         expected, residual = nnls(design, data)
         assert np.linalg.norm(design @ solution - data) <= residual * (1 + 1e-6)
         np.testing.assert_allclose(design @ solution, design @ expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])
+@pytest.mark.parametrize("law", [{"N": 0.01}, {"Q": 0.4, "N": 0.01, "K": 200.0}, {"N": 0.01, "K": 40.0, "R": 3000.0}], ids="+".join)
+def test_fast_fit_is_the_plain_fit(law, share, block):
+    """Against numpy and scipy, one window at a time; every number that errors and limits are made of."""
+    rng = np.random.default_rng([19, block])
+    x = white(rng, 12, 3000, N=law["N"], rate=RATE) + random_walk(rng, 12, 3000, K=law.get("K", 0.0), rate=RATE)
+    x += quantization(rng, 12, 3000, Q=law.get("Q", 0.0), rate=RATE) + law.get("R", 0.0) * np.arange(3000) / RATE / 3600
+    cells, ks, rate, window = fit._inputs(windows_of(lose(rng, x, share, block), taus=21))
+    flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells]
+    flat[0][3, 5] = np.nan
+    tables = fit._tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
+    result, misfit, _ = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 31)
+    for w in range(12):
+        plain = fit_window_plainly(*(cell[w] for cell in flat), tables)
+        assert misfit[w, 0] == pytest.approx(float(plain.pop("chi2")), rel=1e-5)
+        there = plain["square"] > 2.3 * plain["square_stderr"]
+        for row, name in enumerate(FIT_FIELDS[:-1]):
+            np.testing.assert_allclose(result[w, row, there], plain[name][there], rtol=1e-6, atol=1e-12 * abs(plain[name]).max())
+            np.testing.assert_allclose(result[w, row], plain[name], rtol=1e-4, atol=1e-7 * abs(plain[name]).max())
+
+
+def test_windows_are_fitted_alike_alone_and_together():
+    x = np.random.default_rng(20).standard_normal((9, 2000))
+    surface = windows_of(x, taus=21)
+    together = fit_noise(surface)
+    for w in (0, 4, 8):
+        alone = fit_noise(surface.isel(time=[w]))
+        for name in (*TERMS, "N_stderr", "K_upper", "fit_chi2", "edf"):
+            np.testing.assert_array_equal(alone[name].values[:, 0], together[name].values[:, w])
+
+
+@settings(deadline=None)
+@given(st.floats(-4.0, 12.3))
+def test_interpolated_quantile_is_that_of_scipy(exponent):
+    freedom = np.array([10.0**exponent])
+    expected = chi2.ppf(0.05, freedom) / freedom
+    got = interpolate_quantile(freedom, *fit._quantile_curve())
+    np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-250)
+
+
+def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
+    """Random walk alone, its covariances from the weights of the second differences on a sum of white noise."""
+    window, ks = 90, np.array([1, 3, 8, 20])
+    walk = np.tril(np.ones((window, window)))
+    differences = []
+    for k in ks:
+        rows = [np.concatenate([np.zeros(m), -np.ones(k), np.ones(k), np.zeros(window - m - 2 * k)]) for m in range(window - 2 * k + 1)]
+        differences.append(np.array(rows))
+    got = pair_products(window, ks, np.zeros_like(ks))
+    for i, first in enumerate(differences):
+        for j, second in enumerate(differences):
+            white_part = first @ second.T / (2.0 * ks[i] * ks[j])
+            assert got[1, 1, i, j] == pytest.approx(2 * np.mean(white_part**2), rel=1e-9)
+            # the average over each interval of a Brownian motion: half of the step in it, and a part of its own
+            ends = walk - 0.5 * np.eye(window)
+            spread = ends @ ends.T + np.eye(window) / 12
+            walk_part = first @ spread @ second.T / (2.0 * ks[i] * ks[j])
+            assert got[3, 3, i, j] == pytest.approx(2 * np.mean(walk_part**2), rel=1e-9)
+            assert got[1, 3, i, j] == pytest.approx(2 * np.mean(white_part * walk_part), rel=1e-9)
 
 
 def test_every_number_carries_its_unit():

@@ -1,0 +1,87 @@
+"""Time the fit of windows: the kernel, the limits, and what is made once for a surface.
+
+    python -m benchmarks.fit                       # a minute
+    python -m benchmarks.fit --output fit.md
+
+Windows of 5 min at 400 Hz of quantization noise, angle and rate random walk; processor time of one thread, the best of several runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import dask
+import numpy as np
+
+from gyrostab import davar, fit, fit_noise, make_log
+from gyrostab.kernels.covariance import diagonal_products
+from gyrostab.kernels.least_squares import fit_windows, identify_noise
+from tests.noise_records import lose, quantization, random_walk, white
+
+RATE, SAMPLES = 400.0, 6_000_000
+
+
+def best(call: Callable[[], object], repeats: int) -> float:
+    """Least processor time of a call [s], after one that compiles and warms up."""
+    call()
+    seconds = []
+    for _ in range(repeats):
+        start = time.thread_time()
+        call()
+        seconds.append(time.thread_time() - start)
+    return min(seconds)
+
+
+def record(missing: bool) -> np.ndarray:
+    rng = np.random.default_rng(2)
+    x = white(rng, 1, SAMPLES, N=0.01, rate=RATE) + quantization(rng, 1, SAMPLES, Q=0.3, rate=RATE)
+    x += random_walk(rng, 1, SAMPLES, K=2.0, rate=RATE)
+    return lose(rng, x, 0.1, 1000.0) if missing else x
+
+
+def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
+    """Averaging times, and microseconds a window: all, kernel, limits and the rest, quick fit of davar; seconds of the tables."""
+    surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="5min", step="15s", taus=taus)
+    cells, ks, rate, window = fit._inputs(surface)
+    flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells]
+    shifts = np.zeros_like(ks)
+    tables = fit._tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
+    diagonals = diagonal_products(window, ks, shifts)
+    arguments = (tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 31)
+    quick = (tables.columns, tables.weight, tables.to_samples, *diagonals)
+    whole = best(lambda: fit_noise(surface), repeats)
+    kernel = best(lambda: fit_windows(*flat, *arguments), repeats)
+    block = best(lambda: fit._fit_block(flat, tables, 31), repeats)
+    seconds = [whole, kernel, max(block - kernel, 0.0), max(whole - block, 0.0), best(lambda: identify_noise(*flat, *quick), repeats)]
+    once = best(lambda: fit._Tables(ks, shifts, rate, window), 1)
+    return ks.size, [1e6 * s / flat[0].shape[0] for s in seconds] + [once]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, help="write the table to this file instead of the screen")
+    parser.add_argument("--repeats", type=int, default=5)
+    arguments = parser.parse_args()
+    lines = [
+        "| gaps | averaging times | fit_noise, us a window | kernel | limits | rest | quick fit in davar | tables, once, s |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    with dask.config.set(scheduler="sync"):
+        for missing in (False, True):
+            x = record(missing)
+            for taus in (24, 40, 48):
+                size, (whole, kernel, limits, rest, quick, once) = measure(x, taus, arguments.repeats)
+                name = "10 % in blocks of 1000" if missing else "none"
+                lines.append(f"| {name} | {size} | {whole:.0f} | {kernel:.0f} | {limits:.1f} | {rest:.1f} | {quick:.1f} | {once:.2f} |")
+    text = "\n".join(lines) + "\n"
+    if arguments.output:
+        arguments.output.write_text(text)
+    else:
+        print(text, end="")
+
+
+if __name__ == "__main__":
+    main()
