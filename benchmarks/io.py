@@ -42,9 +42,8 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as root:
         rows = [row for form in options.formats for row in compare(form, Path(root, form), options)]
-    print(
-        f"\n{platform.machine()}, {os.cpu_count()} cores, {options.rate:g} Hz, 3 axes, files of one hour with gaps; best of {options.repeat}\n"
-    )
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, {options.rate:g} Hz, 3 axes"
+    print(f"\n{machine}, files of one hour with gaps; best of {options.repeat}\n")
     print("| archive | hours | workers | read [s] | Msamples/s | whole run [s] | Msamples/s | run / read | target |")
     print("|---|---|---|---|---|---|---|---|---|")
     print(*rows, sep="\n")

@@ -88,8 +88,8 @@ def test_what_is_never_missing_is_not(product):
                 assert not np.ma.is_masked(variable[:]), variable.name
 
 
-def snippet(text: str, language: str) -> str:
-    (code,) = re.findall(rf"```{language}\n(.*?)```", text, re.S)
+def snippet(text: str, language: str, what: str = "product.nc") -> str:
+    (code,) = (code for code in re.findall(rf"```{language}\n(.*?)```", text, re.S) if what in code)
     assert len(code.splitlines()) == 3
     return code
 
@@ -124,14 +124,40 @@ def test_the_python_reader(folder, text):
     ],
 )
 def test_the_other_readers(program, language, command, before, folder, text):
-    code = snippet(text, language)
+    number = printed_by(program, [*command, before + snippet(text, language)], folder)
+    assert number == pytest.approx(wanted(folder / "product.nc"), rel=1e-4)
+
+
+def printed_by(program: str, arguments: list[str], folder: Path) -> float:
     if shutil.which(program) is None:
         pytest.skip(f"{program} is absent")
-    done = subprocess.run([program, *command, before + code], cwd=folder, capture_output=True, text=True, timeout=200, check=False)
+    done = subprocess.run([program, *arguments], cwd=folder, capture_output=True, text=True, timeout=200, check=False)
     if not done.stdout and re.search("netcdf|ncdf4|NCDatasets", done.stderr):
         pytest.skip(f"{program} has no package for NetCDF")
-    number = float(re.findall(r"[-+.\deE]+\s*$", done.stdout.strip())[0])
-    assert number == pytest.approx(wanted(folder / "product.nc"), rel=1e-4)
+    return float(re.findall(r"[-+.\deE]+\s*$", done.stdout.strip())[0])
+
+
+@pytest.fixture
+def log_folder(tmp_path) -> tuple[Path, float]:
+    """A log in counts, and the mean of the second minute of its first axis."""
+    log = synthetic.log(samples=1500, rate=10.0)
+    log["rate"] = log.rate.copy(data=np.rint(log.rate.values / 0.01) * 0.01)
+    log["rate"].encoding = {"dtype": np.dtype("i2"), "scale_factor": 0.01}
+    gyrostab.to_netcdf(log, tmp_path / "log.nc", compression="zlib")
+    return tmp_path, float(log.rate[0, 600:1200].mean())
+
+
+@pytest.mark.parametrize(
+    ("program", "language", "command", "before"),
+    [
+        (sys.executable, "python", ["-c"], ""),
+        ("octave", "matlab", ["--no-gui", "--norc", "-q", "--eval"], "pkg load netcdf\nformat long\n"),
+        ("Rscript", "r", ["-e"], ""),
+    ],
+)
+def test_the_readers_of_a_log(program, language, command, before, log_folder, text):
+    folder, mean = log_folder
+    assert printed_by(program, [*command, before + snippet(text, language, "log.nc")], folder) == pytest.approx(mean, rel=1e-5)
 
 
 if __name__ == "__main__":
