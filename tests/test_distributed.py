@@ -1,0 +1,245 @@
+"""A run on a real dask scheduler with two worker processes on loopback: the same bits, and a worker that is killed loses nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyrostab import checkpoint, engine, make_log, to_netcdf, to_zarr
+from gyrostab.cli import main
+from gyrostab.davar import davar_parts
+from gyrostab.errors import OptionError, WorkerError
+from gyrostab.export import open_log
+from gyrostab.run import run
+from gyrostab.schedule import Pool, check_scheduler, in_any_order, open_pool
+
+distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.xdist_group("distributed")
+WINDOW = {"window": "4000samples", "step": "4000samples", "taus": "12"}
+PARTS = 5
+
+
+@pytest.fixture(scope="module")
+def address():
+    """A scheduler and two workers of one thread each, as a user starts them."""
+    environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", memory_limit=0, env=environment, silence_logs=50
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setitem(davar_parts.__kwdefaults__, "samples", 1)
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+
+
+def _log():
+    rate = 5.0 + np.random.default_rng(7).standard_normal((1, 1_270_000))
+    rate[:, 500_000:530_000] = np.nan
+    return make_log(rate, rate=100.0, unit="deg/h", start="2026-05-01")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory) -> Path:
+    return to_netcdf(_log(), tmp_path_factory.mktemp("log") / "tool.nc")
+
+
+@pytest.fixture(scope="module")
+def whole(log, tmp_path_factory) -> bytes:
+    """The product of one thread."""
+    path = tmp_path_factory.mktemp("whole") / "product.nc"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(davar_parts.__kwdefaults__, "samples", 1)
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        run([log], path, windows=WINDOW, workers=1)
+    return path.read_bytes()
+
+
+def test_two_worker_processes_make_the_same_bytes(address, log, whole, tmp_path):
+    run([log], tmp_path / "product.nc", windows=WINDOW, scheduler=address)
+    assert (tmp_path / "product.nc").read_bytes() == whole
+    assert [path.name for path in tmp_path.iterdir()] == ["product.nc"]
+    with distributed.Client(address) as client:
+        seen = client.run(_what_a_worker_knows)
+        assert len(seen) == 2
+        assert all("gyrostab.davar" in loaded for loaded, _ in seen.values())
+        assert all(threads is None for _, threads in seen.values()), "a kernel has started threads of its own"
+
+
+def _what_a_worker_knows():
+    import sys
+
+    import numba
+
+    try:
+        threads = numba.threading_layer()
+    except ValueError:  # numba has none until a parallel kernel runs
+        threads = None
+    return list(sys.modules), threads
+
+
+def test_zarr_store_and_text_on_workers(address, tmp_path):
+    small = _log().isel(time=slice(0, 30_000))
+    store = to_zarr(small, tmp_path / "log.zarr")
+    text = tmp_path / "log.csv"
+    rows = "\n".join(f"{i / 100:.2f},{v}" for i, v in enumerate(small["rate"].values[0]))
+    text.write_text(f"time [s],gyro_x [deg/h]\n{rows}\n")
+    made = {}
+    for source in (store, text):
+        for scheduler in ("threads", address):
+            output = tmp_path / f"{source.suffix[1:]}-{scheduler[:3]}.nc"
+            run([source], output, windows=WINDOW, reading={"epoch": "2026-05-01"} if source == text else {}, scheduler=scheduler)
+            made[source.suffix, scheduler] = open_arrays(output)
+    for suffix in (".zarr", ".csv"):
+        one, other = made[suffix, "threads"], made[suffix, address]
+        assert one.keys() == other.keys()
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def open_arrays(path: Path) -> dict[str, np.ndarray]:
+    import xarray as xr
+
+    with xr.open_dataset(path, decode_times=False) as product:
+        return {str(name): variable.values for name, variable in product.variables.items()}
+
+
+def test_a_killed_worker_does_not_lose_the_run(address, log, whole, tmp_path, monkeypatch):
+    killed = []
+
+    def write(*arguments, **options):
+        if not killed:
+            with distributed.Client(address) as client:
+                processes = client.run(os.getpid)
+                os.kill(next(iter(processes.values())), signal.SIGKILL)
+                killed.append(processes)
+        return checkpoint.write_block(*arguments, **options)
+
+    monkeypatch.setattr(engine, "write_block", write)
+    monkeypatch.setattr(engine, "_HELD_SECONDS", 0.0)
+    run([log], tmp_path / "product.nc", windows=WINDOW, scheduler=address)
+    assert killed
+    assert (tmp_path / "product.nc").read_bytes() == whole
+
+
+def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
+    """Names travel, not samples: the same few bytes a part for ten times the samples."""
+    sent: list[int] = []
+
+    def spy(pool, calls):
+        def watched():
+            for call in calls:
+                sent.append(len(pickle.dumps(call)))
+                yield call
+
+        return in_any_order(pool, watched())
+
+    @contextmanager
+    def elsewhere(*arguments, **options):
+        with ThreadPoolExecutor(1) as executor:
+            yield Pool(executor.submit, lambda: 1, True, lambda value: value)
+
+    monkeypatch.setattr(engine, "in_any_order", spy)
+    monkeypatch.setattr("gyrostab.run.open_pool", elsewhere)
+    sizes = {}
+    for samples in (130_000, 1_270_000):
+        path = to_netcdf(open_log(log).isel(time=slice(0, samples)), tmp_path / f"log{samples}.nc")
+        del sent[:]
+        run([path], tmp_path / f"{samples}.nc", windows=WINDOW, scheduler="processes")
+        sizes[samples] = list(sent)
+    assert [len(found) for found in sizes.values()] == [1, PARTS]
+    assert max(sizes[1_270_000]) <= max(sizes[130_000]) + 20
+    assert max(sizes[1_270_000]) < 2000
+
+
+# ------------------------------------------------------------------------------------------------------- what goes wrong
+
+
+def test_no_scheduler_there(log, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr("gyrostab.schedule._TIMEOUT", 1.0)
+    arguments = ["run", str(log), "-o", str(tmp_path / "p.nc"), "--window", "40s", "--scheduler", "127.0.0.1:9", "--quiet-progress"]
+    assert main(arguments) == 2
+    shown = capfd.readouterr().err
+    assert "no dask scheduler answers there" in shown
+    assert "Traceback" not in shown
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_worker_that_does_not_see_the_files(address, tmp_path):
+    with pytest.raises(WorkerError, match=r"does not see .*nowhere\.csv; all workers need the same file system"):
+        _open(address, tmp_path / "nowhere.csv")
+
+
+def _open(address: str, path: Path) -> None:
+    """Pretend that the file is there, as it is on another machine's disk."""
+    from gyrostab import schedule
+
+    real = schedule._size
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule, "_size", lambda name: 100 if Path(name) == path else real(name))
+        with open_pool(address, files=[path]):
+            pass
+
+
+def test_a_scheduler_without_workers(monkeypatch):
+    monkeypatch.setattr("gyrostab.schedule._TIMEOUT", 3.0)
+    cluster = distributed.LocalCluster(n_workers=0, dashboard_address=":0", processes=True, silence_logs=50)
+    with cluster, pytest.raises(WorkerError, match="has no workers; start some with 'dask worker"), open_pool(cluster.scheduler_address):
+        pass
+
+
+def test_distributed_is_not_installed(log, tmp_path):
+    code = (
+        "import sys; sys.modules['distributed'] = None; from gyrostab.cli import main; "
+        f"sys.exit(main(['run', {str(log)!r}, '-o', {str(tmp_path / 'p.nc')!r}, '--scheduler', 'tcp://127.0.0.1:1']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 2
+    assert "pip install 'gyrostab[distributed]'" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["thread", "cluster", ""])
+def test_a_scheduler_that_is_no_scheduler(name):
+    with pytest.raises(OptionError, match="give threads, processes, or the address"):
+        check_scheduler(name)
+
+
+def test_a_worker_process_that_dies_is_explained():
+    with open_pool("processes", workers=1) as pool, pytest.raises(WorkerError, match="a worker process has died"):
+        list(in_any_order(pool, [(os._exit, 3)]))
+
+
+def test_worker_processes_end_with_a_killed_parent(tmp_path):
+    code = (
+        "import os, signal\n"
+        "from gyrostab.schedule import open_pool\n"
+        "if __name__ == '__main__':\n"
+        "    with open_pool('processes', workers=1) as pool:\n"
+        "        print(pool.submit(os.getpid).result(), flush=True)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    script = tmp_path / "parent.py"
+    script.write_text(code)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    child = int(done.stdout)
+    for _ in range(200):
+        try:
+            os.kill(child, 0)
+        except ProcessLookupError:
+            return
+        if Path(f"/proc/{child}/stat").read_text().split()[2] == "Z":
+            return
+        time.sleep(0.05)
+    pytest.fail("the worker lives on")
