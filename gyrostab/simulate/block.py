@@ -82,7 +82,6 @@ def next_block(
     count: int,
     units: Sequence[Units],
     parts: Mapping[str, tuple[Stretch, Any]],
-    missing: NDArray[np.bool_] | None,
 ) -> tuple[Array, BlockState]:
     """Make the samples ``first`` to ``first + count`` of a log.
 
@@ -97,8 +96,6 @@ def next_block(
         Random numbers of each axis.
     parts : mapping
         Stretches of the long channels, by name.
-    missing : ndarray of bool, shape (axes, count), optional
-        Samples to be left out, besides the gaps of the plan.
 
     Returns
     -------
@@ -145,7 +142,7 @@ def next_block(
     for number in by_stage["logger"]:
         step, values = act(number, fast=False, true=true, signal=slow[list(plan.steps[number].rows)])
         slow[list(step.rows)] = values
-    _lose(plan, slow, first, missing)
+    _lose(plan, slow, first)
     return slow, state
 
 
@@ -186,13 +183,11 @@ def _sample(plan: Plan, numbers: list[int], act: Any, signal: Array, true: Mappi
     return np.stack([row if row.size == count else row.reshape(count, plan.oversampling).mean(axis=1) for row in rows])
 
 
-def _lose(plan: Plan, rate: Array, first: int, missing: NDArray[np.bool_] | None) -> None:
+def _lose(plan: Plan, rate: Array, first: int) -> None:
     """Put NaN into the gaps."""
     count = rate.shape[1]
     for begin, end in plan.gaps[np.searchsorted(plan.gaps[:, 1], first, side="right") : np.searchsorted(plan.gaps[:, 0], first + count)]:
         rate[:, max(begin - first, 0) : end - first] = np.nan
-    if missing is not None:
-        rate[np.asarray(missing)] = np.nan
 
 
 def check_effects(steps: Sequence[Step]) -> list[Step]:

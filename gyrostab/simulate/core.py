@@ -31,7 +31,7 @@ from gyrostab.windows import duration_seconds
 __all__ = ["simulate"]
 
 #: Samples of the instrument in one block of the lazy log.
-BLOCK = 2**18
+BLOCK = 2**17
 _RESTART = GAP_CAUSES.index("restart")
 
 
@@ -71,7 +71,7 @@ def simulate(
     -------
     xarray.Dataset
         ``rate(axis, time)`` [degree hour-1], lazy, NaN at every missing sample; the channels; the table of gaps.
-        Chunks are made one after the other, so that a late one needs those before it.
+        Its chunks are made one after the other and remember how to go on; a late one alone needs those before it, once.
 
     Raises
     ------
@@ -103,10 +103,9 @@ def simulate(
         begin_noise(frame.seed, axis, rate=frame.rate * frame.oversampling, terms=_terms(plan, row), flicker_band=made.flicker_band)
         for row, axis in enumerate(frame.axes)
     ]
-    signal = None if like is None else like[signal_name(like)].transpose("axis", "time").data
-    data = lazy_rates(
-        plan, _begin(plan, frame.seed), starts, frame.size, missing_in=signal, chunk=chunk or max(1, BLOCK // frame.oversampling)
-    )
+    data = lazy_rates(plan, _begin(plan, frame.seed), starts, frame.size, chunk=chunk or max(1, BLOCK // frame.oversampling))
+    if like is not None:
+        data = _lost(data, like[signal_name(like)].transpose("axis", "time").data)
     return _labelled(made, frame, world, table, data)
 
 
@@ -266,6 +265,13 @@ def _begin(plan: Plan, seed: int) -> BlockState:
         counts[name] = counts.get(name, 0) + 1
         states.append(step.effect.begin(step.setup, stream(seed, "effect", name, counts[name])))
     return BlockState(states)
+
+
+def _lost(data: Any, signal: Any) -> Any:
+    """The samples that are NaN in `signal` are lost here too."""
+    import dask.array as da
+
+    return da.where(da.isnan(da.asarray(signal)).rechunk(data.chunks), np.nan, data)
 
 
 def _labelled(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], data: Any) -> xr.Dataset:

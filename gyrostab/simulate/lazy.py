@@ -1,60 +1,132 @@
-"""The rates of a simulated log as a dask array: chains of blocks, each of which hands its state to the next."""
+"""The rates of a simulated log as a dask array whose blocks follow one from another, and can be had in any order."""
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gyrostab.simulate.block import BlockState, Plan, next_block
-from gyrostab.simulate.drivers import SHORT, Source, Stretch
-from gyrostab.simulate.noise import NoiseState, Units, draw
+from gyrostab.simulate.drivers import SHORT, Stretch
+from gyrostab.simulate.noise import NoiseState, draw
 from gyrostab.timegrid import grid_times
 
-__all__ = ["lazy_rates"]
+__all__ = ["Chain", "lazy_rates"]
 
-#: Blocks of random numbers that may be waiting for the block in which they are used.
-AHEAD = 2
-
-
-def _initial(state: Any) -> tuple[None, Any]:
-    """What there was before the first block."""
-    return None, state
+#: Results that a chain keeps, for the threads that ask for them a little later.
+RECENT = 3
+#: States that a chain keeps over its whole length, to begin again from.
+STATES = 512
 
 
-def _draw(previous: tuple[Any, NoiseState], first: int, size: int, gate: Any) -> tuple[Units, NoiseState]:
-    """The random numbers of the next block of an axis; `gate` only holds them back, so that they do not run far ahead."""
-    return draw(previous[1], first, size)
+class Chain:
+    """Steps of which each needs the state after the one before.
+
+    A chain remembers states on its way, so that going through it costs every step once, however it is cut into calls, and going back
+    costs little. Threads may ask at the same time. A copy in another process starts anew; the results are the same.
+
+    Parameters
+    ----------
+    step : callable
+        (number of the step, state before it) -> (result, state after it); leaves the state given as it is.
+    state : object
+        State before step 0.
+    length : int
+        Number of steps.
+    """
+
+    def __init__(self, step: Callable[[int, Any], tuple[Any, Any]], state: Any, length: int):
+        self._step, self._stride = step, max(1, length // STATES)
+        self._states = {0: state}
+        self._recent: dict[int, Any] = {}
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_step": self._step, "_stride": self._stride, "_states": {0: self._states[0]}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _recent={}, _lock=threading.Lock())
+
+    def __call__(self, number: int) -> Any:
+        """Result of a step."""
+        with self._lock:
+            if number not in self._recent:
+                known = max(place for place in self._states if place <= number)
+                for place in range(known, number + 1):
+                    self._recent[place], self._states[place + 1] = self._step(place, self._states[place])
+                    self._forget(place)
+            return self._recent[number]
+
+    def _forget(self, place: int) -> None:
+        while len(self._recent) > RECENT:
+            del self._recent[next(iter(self._recent))]
+        old = place - 2 * RECENT
+        if old > 0 and old % self._stride:
+            self._states.pop(old, None)
 
 
-def _step(plan: Plan, previous: tuple[Any, BlockState], first: int, count: int, draws: Any, parts: Any, missing: Any) -> Any:
-    """The next block of the log."""
-    stretches = {}
-    for name, low, high, offset, pieces in parts:
-        values = np.concatenate([np.asarray(piece, dtype=np.float64) for piece in pieces])
-        stretches[name] = (Stretch(low, high), values[low - offset : high - offset])
-    return next_block(plan, previous[1], first, count, [one[0] for one in draws], stretches, missing)
+class _Channel:
+    """A long channel, chunk by chunk; a chunk that is computed lazily has a small graph of its own."""
+
+    def __init__(self, values: Any):
+        import dask.array as da
+
+        array = da.asarray(values, chunks=SHORT)
+        self.edges = np.concatenate([[0], np.cumsum(array.chunks[0])])
+        graph = array.__dask_graph__()
+        self.chunks = [(graph.cull([key]).to_dict(), key) for key in array.__dask_keys__()]
+
+    def __call__(self, stretch: Stretch) -> NDArray[np.float64]:
+        from dask.local import get_sync
+
+        first, last = np.searchsorted(self.edges, [stretch.low, stretch.high - 1], side="right") - 1
+        pieces = [get_sync(*self.chunks[number]) for number in range(first, last + 1)]
+        offset = int(self.edges[first])
+        return np.concatenate(pieces).astype(np.float64)[stretch.low - offset : stretch.high - offset]
 
 
-def _needed(source: Source, edges: Any, stretch: Stretch) -> list[Any]:
-    """Stretch of a long channel, and the chunks that hold it."""
-    first, last = np.searchsorted(edges, [stretch.low, stretch.high - 1], side="right") - 1
-    keys = [(source.values.name, int(number)) for number in range(first, last + 1)]
-    return [source.name, stretch.low, stretch.high, int(edges[first]), keys]
+class _Log:
+    """The blocks of a log: a chain of random numbers for each axis, and the chain of the blocks themselves."""
+
+    def __init__(self, plan: Plan, state: BlockState, starts: Sequence[NoiseState], counts: Sequence[int]):
+        long = {name: source for name, source in plan.sources.items() if source.stamps is None}
+        self.channels: Mapping[str, _Channel] = {name: _Channel(source.values) for name, source in long.items()}
+        self.plan = replace(plan, sources={**plan.sources, **{name: replace(one, values=None) for name, one in long.items()}})
+        self.firsts, self.counts = np.concatenate([[0], np.cumsum(counts)]).tolist(), list(counts)
+        self.draws = [Chain(self._draw, start, len(counts)) for start in starts]
+        self.blocks = Chain(self._block, state, len(counts))
+
+    def _draw(self, number: int, state: NoiseState) -> Any:
+        factor = self.plan.oversampling
+        return draw(state, self.firsts[number] * factor, self.counts[number] * factor)
+
+    def _block(self, number: int, state: BlockState) -> Any:
+        first, count, factor = self.firsts[number], self.counts[number], self.plan.oversampling
+        instants = np.array([max(first * factor - 1, 0), (first + count) * factor - 1])
+        before, end = grid_times(self.plan.start, self.plan.rate * factor, instants).tolist()
+        parts = {}
+        for name, channel in self.channels.items():
+            stretch = self.plan.sources[name].stretch(before, end)
+            assert stretch is not None
+            parts[name] = (stretch, channel(stretch))
+        return next_block(self.plan, state, first, count, [one(number) for one in self.draws], parts)
+
+    def __call__(self, number: int) -> NDArray[np.float64]:
+        """Rates of a block; two threads with neighbouring blocks draw for different axes at the same time."""
+        for one in self.draws:
+            one(number)
+        return np.asarray(self.blocks(number))
 
 
-def _arrays(sources: Mapping[str, Source]) -> dict[str, Source]:
-    """The long channels, as dask arrays."""
-    import dask.array as da
-
-    long = {name: source for name, source in sources.items() if source.stamps is None}
-    return {name: replace(source, values=da.asarray(source.values, chunks=SHORT)) for name, source in long.items()}
+def _rates(log: _Log, number: int) -> NDArray[np.float64]:
+    return log(number)
 
 
-def lazy_rates(plan: Plan, state: BlockState, starts: Sequence[NoiseState], size: int, *, missing_in: Any = None, chunk: int) -> Any:
+def lazy_rates(plan: Plan, state: BlockState, starts: Sequence[NoiseState], size: int, *, chunk: int) -> Any:
     """Rates of a whole log, block by block.
 
     Parameters
@@ -66,8 +138,6 @@ def lazy_rates(plan: Plan, state: BlockState, starts: Sequence[NoiseState], size
         Noise of each axis before the first sample.
     size : int
         Samples of the log.
-    missing_in : ndarray or dask array, shape (axes, size), optional
-        Signal whose NaN the log shall have too.
     chunk : int
         Samples of a block.
 
@@ -77,36 +147,11 @@ def lazy_rates(plan: Plan, state: BlockState, starts: Sequence[NoiseState], size
         Rate [degree hour-1].
     """
     import dask.array as da
-    from dask.base import tokenize
     from dask.highlevelgraph import HighLevelGraph
 
-    factor = plan.oversampling
-    counts = [min(chunk, size - first) for first in range(0, size, chunk)]
-    long = _arrays(plan.sources)
-    edges = {name: np.concatenate([[0], np.cumsum(source.values.chunks[0])]) for name, source in long.items()}
-    mask = None if missing_in is None else da.isnan(da.asarray(missing_in)).rechunk({0: -1, 1: tuple(counts)})
-    token = tokenize(plan.start, plan.rate, size, chunk, np.random.default_rng().integers(2**62))
-    rate, step, noise, fixed = (f"{word}-{token}" for word in ("simulated-rate", "simulate-block", "draw-noise", "simulation-plan"))
-    tasks: dict[Any, Any] = {
-        fixed: replace(plan, sources={**plan.sources, **{name: replace(one, values=None) for name, one in long.items()}})
-    }
-    tasks[(step, -1)] = (_initial, state)
-    for row, start in enumerate(starts):
-        tasks[(noise, row, -1)] = (_initial, start)
-    for k, count in enumerate(counts):
-        first = k * chunk
-        instants = np.array([max(first * factor - 1, 0), (first + count) * factor - 1])
-        before, end = grid_times(plan.start, plan.rate * factor, instants).tolist()
-        draws = [(noise, row, k) for row in range(len(starts))]
-        for row, key in enumerate(draws):
-            tasks[key] = (_draw, (noise, row, k - 1), first * factor, count * factor, (step, max(-1, k - 1 - AHEAD)))
-        parts = []
-        for name, source in long.items():
-            stretch = source.stretch(before, end)
-            assert stretch is not None
-            parts.append(_needed(source, edges[name], stretch))
-        tasks[(step, k)] = (_step, fixed, (step, k - 1), first, count, draws, parts, None if mask is None else (mask.name, 0, k))
-        tasks[(rate, 0, k)] = (operator.itemgetter(0), (step, k))
-    arrays = [*(source.values for source in long.values()), *([] if mask is None else [mask])]
-    graph = HighLevelGraph.from_collections(rate, tasks, dependencies=arrays)
-    return da.Array(graph, rate, chunks=((len(plan.axes),), tuple(counts)), dtype=np.float64)
+    counts = tuple(min(chunk, size - first) for first in range(0, size, chunk))
+    token = f"{np.random.default_rng().integers(2**62):x}"
+    name, log = f"simulated-rate-{token}", f"simulation-{token}"
+    tasks: dict[Any, Any] = {(name, 0, number): (_rates, log, number) for number in range(len(counts))}
+    tasks[log] = _Log(plan, state, starts, counts)
+    return da.Array(HighLevelGraph.from_collections(name, tasks), name, chunks=((len(plan.axes),), counts), dtype=np.float64)
