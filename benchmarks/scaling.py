@@ -1,0 +1,166 @@
+"""How the time of a run grows with the length of the log, the number of averaging times, and the window over the step; and its memory.
+
+    python benchmarks/scaling.py [--hours 1 2 4 8 16] [--workers 2] [--rounds 3] [--output scaling.md]
+
+Each run is the whole `gyrostab run` (read, DAVAR, fit, write) in a process of its own, from a Zarr store of integer counts of three
+axes at 400 Hz, so that its peak memory is its own. The time of the best of several rounds counts; what a run of the
+shortest log needs to start (imports, compiled kernels) is measured too and left out of the exponent. The tables are Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+RATE, AXES, COUNT = 400.0, 3, 0.02
+WINDOW = {"window": "10min", "step": "1min", "taus": "40"}
+
+# One run; prints seconds of the work itself, seconds until it could begin, peak memory [MiB] and samples.
+_RUN = """
+import json, resource, sys, time
+begun = time.perf_counter()
+def work(paths, output, windows, options):
+    from gyrostab.run import run
+    stages = []
+    def stage(label, total=0, done=None, unit="samples"):
+        if not stages or stages[-1][0] != label:
+            stages.append((label, time.perf_counter()))
+    start = time.perf_counter()
+    run(paths, output, windows=windows, overwrite=True, stage=stage, **options)
+    end = time.perf_counter()
+    spans = {label: after - before for (label, before), (_, after) in zip(stages, [*stages[1:], ("", end)])}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps({"seconds": end - start, "load": start - begun, "peak": peak, "spans": spans}))
+if __name__ == "__main__":
+    work(*json.loads(sys.argv[1]))
+"""
+
+
+def write_store(path: Path, hours: float) -> Path:
+    """White counts on a slow walk, chunk by chunk, as `gyrostab ingest` stores them."""
+    import dask.array as da
+
+    from gyrostab import make_log, to_zarr
+
+    size, chunk = round(hours * 3600 * RATE), round(1200 * RATE)
+
+    def counts(block_info: dict) -> np.ndarray:
+        axis, part = block_info[None]["chunk-location"]
+        shape = block_info[None]["chunk-shape"]
+        draw = np.random.default_rng((axis, part))
+        return COUNT * np.rint(180.0 * draw.standard_normal(shape) + 300.0 + np.cumsum(0.05 * draw.standard_normal(shape), axis=1))
+
+    values = da.map_blocks(counts, chunks=((1,) * AXES, da.core.normalize_chunks(chunk, (size,))[0]), dtype=float, meta=np.empty((0, 0)))
+    log = make_log(values, rate=RATE, unit="deg/h", start="2026-05-01")
+    signal = log["rate"]
+    signal.encoding = {"dtype": "int32", "scale_factor": COUNT}
+    return to_zarr(log, path, overwrite=True)
+
+
+def measure(store: Path, windows: dict[str, str], options: dict[str, object], rounds: int) -> dict:
+    """The best of several runs; the largest of their peaks of memory."""
+    found = []
+    for _ in range(rounds):
+        command = [sys.executable, "-c", _RUN, json.dumps([[str(store)], str(store.with_name("product.nc")), windows, options])]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(done.stderr)
+        found.append(json.loads(done.stdout.splitlines()[-1]))
+    return {**min(found, key=lambda one: one["seconds"]), "peak": max(one["peak"] for one in found)}
+
+
+def exponent(hours: list[float], seconds: list[float]) -> tuple[float, float]:
+    """Slope of log time against log length, and its standard error."""
+    x, y = np.log(hours), np.log(seconds)
+    design = np.stack([x, np.ones_like(x)], axis=1)
+    solution = np.linalg.lstsq(design, y, rcond=None)[0]
+    rest = y - design @ solution
+    scatter = rest @ rest / max(len(x) - 2, 1)
+    return float(solution[0]), float(np.sqrt(scatter * np.linalg.inv(design.T @ design)[0, 0]))
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    return "\n".join(["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def machine() -> str:
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        name = next((line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")), name)
+    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}, load {os.getloadavg()[0]:.1f} at the end"
+
+
+def against_length(folder: Path, given: argparse.Namespace, options: dict[str, object]) -> str:
+    rows, times, bare = [], [], []
+    empty = measure(write_store(folder / "empty.zarr", 0.2), WINDOW, options, given.rounds)
+    for hours in given.hours:
+        one = measure(write_store(folder / "log.zarr", hours), WINDOW, options, given.rounds)
+        samples = AXES * hours * 3600 * RATE
+        times.append(one["seconds"])
+        bare.append(max(one["seconds"] - empty["seconds"], 1e-3))
+        spans = [one["spans"].get(name, 0.0) for name in ("reading", "computing", "writing")]
+        rows.append(
+            [f"{hours:g} h", f"{samples / 1e6:.1f}", f"{one['seconds']:.2f}", *(f"{span:.2f}" for span in spans),
+             f"{samples / one['seconds'] / 1e6:.1f}", f"{1e9 * one['seconds'] / samples:.1f}", f"{one['peak']:.0f}"]
+        )  # fmt: skip
+    head = ["length", "10^6 samples", "seconds", "of that open", "compute", "write", "Msamples/s", "ns a sample", "peak MiB"]
+    text = table(head, rows)
+    for name, seconds in (("whole", times), (f"less {empty['seconds']:.2f} s for a log of 12 min", bare)):
+        if len(given.hours) > 2:
+            slope, error = exponent(given.hours, seconds)
+            text += f"\n\nExponent of time against length, {name}: {slope:.3f} ± {error:.3f}."
+    return text
+
+
+def against_options(folder: Path, given: argparse.Namespace, options: dict[str, object]) -> str:
+    hours = given.hours[len(given.hours) // 2]
+    store = write_store(folder / "log.zarr", hours)
+    rows = []
+    for change in (
+        *({"taus": taus} for taus in ("10", "20", "40", "80")),
+        *({"step": step} for step in ("10min", "5min", "2min", "1min", "30s")),
+        *({"window": window, "step": step} for window, step in (("2min", "12s"), ("10min", "1min"), ("1h", "6min"))),
+        {"overlap": "octave"},
+    ):
+        windows = {**WINDOW, **change}
+        one = measure(store, windows, options, given.rounds)
+        samples = AXES * hours * 3600 * RATE
+        named = [windows["window"], windows["step"], windows["taus"], windows.get("overlap", "full")]
+        rows.append([*named, f"{one['seconds']:.2f}", f"{1e9 * one['seconds'] / samples:.1f}", f"{one['peak']:.0f}"])
+    return f"Log of {hours:g} h.\n\n" + table(["window", "step", "taus", "overlap", "seconds", "ns a sample", "peak MiB"], rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", type=float, nargs="+", default=[1.0, 2.0, 4.0, 8.0, 16.0])
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--scheduler", default="threads")
+    parser.add_argument("--only", choices=("length", "options"))
+    parser.add_argument("--output", type=Path)
+    given = parser.parse_args()
+    options: dict[str, object] = {"workers": given.workers, "scheduler": given.scheduler}
+    parts = []
+    with tempfile.TemporaryDirectory() as name:
+        if given.only != "options":
+            parts.append("### Time and memory against length\n\n" + against_length(Path(name), given, options))
+        if given.only != "length":
+            parts.append("### Against averaging times, and window over step\n\n" + against_options(Path(name), given, options))
+    parts.append(f"{machine()}; {given.scheduler}, {given.workers} workers, best of {given.rounds}.")
+    text = "\n\n".join(parts)
+    print(text)
+    if given.output:
+        given.output.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
