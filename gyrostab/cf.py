@@ -243,6 +243,10 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
     attrs = variable.attrs if attrs is None else attrs
     if " since " not in str(attrs.get("units", "")):
         return variable
+    step = {f"microseconds since {_EPOCH}": 1000, f"nanoseconds since {_EPOCH}": 1}.get(attrs["units"])
+    if step and variable.dtype.kind == "i":  # as we write them; xarray comes to the same, but takes its time
+        rest = {key: value for key, value in variable.attrs.items() if key not in ("units", "calendar")}
+        return xr.Variable(variable.dims, (np.asarray(variable.values, dtype=np.int64) * step).view("datetime64[ns]"), rest)
     timed = variable.copy(deep=False)
     timed.attrs = {**variable.attrs, "units": attrs["units"], "calendar": attrs.get("calendar", "standard")}
     decoded: xr.Variable = xr.conventions.decode_cf_variable("time", timed).load()
