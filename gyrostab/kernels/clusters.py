@@ -14,15 +14,22 @@ __all__ = ["cluster_cell", "cluster_prefix"]
 
 
 @njit(nogil=True, cache=True)
-def cluster_prefix(present):  # type: ignore[no-untyped-def]
-    """Running number of present samples and of run starts before each sample, shape (n + 1,) each."""
-    n = present.size
-    samples = np.zeros(n + 1, np.int64)
-    runs = np.zeros(n + 1, np.int64)
-    for i in range(n):
-        samples[i + 1] = samples[i] + (1 if present[i] else 0)
-        runs[i + 1] = runs[i] + (1 if present[i] and (i == 0 or not present[i - 1]) else 0)
-    return samples, runs
+def cluster_prefix(starts, stops, n):  # type: ignore[no-untyped-def]
+    """From runs of present samples: the mask (n,), and the number of present samples and of run starts before each, (n + 1,)."""
+    present = np.zeros(n, np.bool_)
+    samples = np.zeros(n + 1, np.int32)
+    runs = np.zeros(n + 1, np.int32)
+    count = 0
+    for r in range(starts.size):
+        present[starts[r] : stops[r]] = True
+        inside = samples[starts[r] + 1 : stops[r] + 1]
+        for i in range(inside.size):
+            inside[i] = count + i + 1
+        count += inside.size
+        following = starts[r + 1] if r + 1 < starts.size else n
+        samples[stops[r] + 1 : following + 1] = count
+        runs[starts[r] + 1 : following + 1] = r + 1
+    return present, samples, runs
 
 
 @njit(nogil=True, cache=True)
@@ -86,8 +93,8 @@ def cluster_cell(theta, present, samples, runs, first, window, k):  # type: igno
     ----------
     theta : float64 (n + 1,)
         Integral of the rate over present samples, gaps adding nothing.
-    present : bool (n,); samples, runs : int64 (n + 1,)
-        The mask and `cluster_prefix` of it.
+    present : bool (n,); samples, runs : int32 (n + 1,)
+        As from `cluster_prefix`.
     first, window, k : int
         First sample of the window, its length, averaging factor.
 

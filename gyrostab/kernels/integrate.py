@@ -26,6 +26,8 @@ __all__ = [
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 # Samples that are integrated, measured and thinned while they are in the cache.
 _TILE = 4096
+# Samples that are looked at one by one where some of them are missing.
+_LOOK = 512
 
 
 @njit(nogil=True, cache=True)
@@ -48,15 +50,19 @@ def _sum(x, base):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _sum_present(x, base):  # type: ignore[no-untyped-def]
     """Sum of ``x - base`` over finite samples, and their number."""
-    total = _sum(x, base)
-    if np.isfinite(total):
-        return total, x.size
     total = 0.0
     count = 0
-    for i in range(x.size):
-        if np.isfinite(x[i]):
-            total += x[i] - base
-            count += 1
+    for a in range(0, x.size, _LOOK):
+        part = x[a : a + _LOOK]
+        one = _sum(part, base)
+        if np.isfinite(one):
+            total += one
+            count += part.size
+            continue
+        for i in range(part.size):
+            if np.isfinite(part[i]):
+                total += part[i] - base
+                count += 1
     return total, count
 
 
@@ -81,8 +87,8 @@ def present_runs(x):  # type: ignore[no-untyped-def]
     stops = np.empty(16, np.int64)
     run = 0
     inside = False
-    for a in range(0, x.size, 64):
-        part = x[a : a + 64]
+    for a in range(0, x.size, _LOOK):
+        part = x[a : a + _LOOK]
         if inside and np.isfinite(_sum(part, 0.0)):
             continue
         for i in range(part.size):

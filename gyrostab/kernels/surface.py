@@ -98,10 +98,7 @@ def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, ce
 @njit(nogil=True, cache=True)
 def _bridge_gaps(theta, starts, stops, window, step, ks, poor, cells):  # type: ignore[no-untyped-def]
     """Weighted clusters where too few terms are left (rate logs only)."""
-    present = np.zeros(theta.size - 1, np.bool_)
-    for r in range(starts.size):
-        present[starts[r] : stops[r]] = True
-    samples, runs = cluster_prefix(present)
+    present, samples, runs = cluster_prefix(starts, stops, theta.size - 1)
     for i in range(ks.size):
         for j in range(poor.shape[0]):
             if poor[j, i]:
