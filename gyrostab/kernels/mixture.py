@@ -34,9 +34,9 @@ DATA = 5
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def combine_products(pairs, ramps, tables):  # type: ignore[no-untyped-def]
-    """Rows of the products of terms, both orders of a pair added, as the kernels read them: (n, `PRODUCTS`, n)."""
+    """Rows of the products of terms on and above the diagonal, both orders of a pair added, to `tables` (n, `PRODUCTS`, n)."""
     for i in range(pairs.shape[2]):
-        for j in range(pairs.shape[2]):
+        for j in range(i, pairs.shape[2]):
             table = 0
             for a in range(4):
                 for b in range(a, 5):
@@ -126,10 +126,10 @@ def variance_parts(root, term, inverse, tables, weights, part, out):  # type: ig
             total = 0.0
             for i in range(n):
                 line, share = tables[i, table], inverse[i]
-                dot = 0.0
-                for j in range(n):
+                dot = -0.5 * line[i] * part[i] * share
+                for j in range(np.uint64(i & -LANES), np.uint64(n)):
                     dot += line[j] * part[j] * min(share, inverse[j])
-                total += dot * part[i]
+                total += 2.0 * dot * part[i]
             out[(a == term) + (b == term)] += total
 
 
