@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.correlate.judge import VERDICTS
+from gyrostab.correlate.judge import VERDICTS, chance
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import COLOURS, axis_names, new_figure, unit_label
@@ -26,8 +26,8 @@ _MOST = 3000
 def plot_correlation(result: xr.Dataset, *, axis: str | None = None, driver: str | None = None) -> Figure:
     """Draw every variable against the channel at its lag, one row a variable and one column an axis.
 
-    Filled triangles up are windows in which the channel rises, open triangles down those in which it falls; the line is the
-    sensitivity, the band its interval about the middle of the data.
+    Filled triangles up are windows in which the channel rises, open triangles down those in which it falls. The band holds the
+    slopes that the record allows, about the middle of the data; a line, the sensitivity, is drawn only where a coupling is claimed.
 
     Parameters
     ----------
@@ -93,20 +93,40 @@ def _draw(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
     for part_of, style in styles:
         chosen = np.flatnonzero(good & part_of)[::every]
         panel.plot(x[chosen], y[chosen], linestyle="none", markersize=3.5, alpha=0.75, markeredgewidth=0.7, **style)
-    verdict = VERDICTS[int(cell["coupling_verdict"])].replace("_", " ")
-    p = float(cell["p_value_adjusted"])
-    late = f", {lag:.3g} s late" if lag else ""
-    panel.set_title(f"{verdict}{late}" + (f", p = {p:.2g}" if np.isfinite(p) else ""), fontsize="small")
+    verdict = VERDICTS[int(cell["coupling_verdict"])]
+    panel.set_title(_heading(verdict, lag, float(cell["p_value_adjusted"])), fontsize="small")
+    if not good.any():
+        panel.text(
+            0.5,
+            0.5,
+            f"{variable.replace('_', ' ')} is in no window\nabove the other noise",
+            ha="center",
+            va="center",
+            transform=panel.transAxes,
+        )
+        panel.tick_params(left=False, labelleft=False)
+        return
     slope, low, high = (float(part[f"{variable}_per_{driver}{end}"]) for end in ("", "_low", "_high"))
-    if not good.any() or not np.isfinite(slope):
+    if not np.isfinite(slope):
         return
     ends = np.linspace(x[good].min(), x[good].max(), 50)
     middle, level = float(np.mean(x[good])), float(np.mean(y[good]))
     span = np.ptp(y[good]) or 1.0
-    panel.plot(ends, level + slope * (ends - middle), color="black", linewidth=1.2)
+    if verdict == "coupled":
+        panel.plot(ends, level + slope * (ends - middle), color="black", linewidth=1.2)
     edges = [level + value * (ends - middle) for value in (low, high)]
     panel.fill_between(ends, np.minimum(*edges), np.maximum(*edges), color="#8c8c8c", alpha=0.3, linewidth=0)
     panel.set_ylim(y[good].min() - 0.1 * span, y[good].max() + 0.1 * span)
+
+
+def _heading(verdict: str, lag: float, p: float) -> str:
+    """What is said above a panel; a p-value only where it is one of the whole story."""
+    late = f", {lag:.3g} s late" if lag else ""
+    if verdict == "cannot_tell":
+        return "cannot tell"
+    if verdict == "not_told_apart":
+        return f"not told apart from another cause{late}"
+    return f"{verdict.replace('_', ' ')}{late}, p {'' if p < 1e-4 else '= '}{chance(p)}"
 
 
 def _shifted(driver: xr.DataArray, lag: float) -> tuple[Any, Any]:
@@ -130,5 +150,5 @@ def _key(driver: str, level: float) -> list[Any]:
     return [
         Line2D([], [], linestyle="none", marker="^", color=_UP, label=f"{what} rises"),
         Line2D([], [], linestyle="none", marker="v", color=_DOWN, markerfacecolor="none", label=f"{what} falls"),
-        Patch(facecolor="#8c8c8c", alpha=0.3, edgecolor="black", label=f"sensitivity, {level:.0%} interval"),
+        Patch(facecolor="#8c8c8c", alpha=0.3, edgecolor="black", label=f"slopes the record allows ({level:.0%}); line: coupled"),
     ]
