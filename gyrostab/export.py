@@ -123,9 +123,7 @@ def _filters(compression: str | None, *, log: bool) -> dict[str, Any]:
     return {"zlib": True, "complevel": 4, "shuffle": True}
 
 
-def to_zarr(
-    dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None
-) -> Path:
+def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None) -> Path:
     """Write a product, a DAVAR surface or a log as a Zarr store (a directory, format 2), by the same rules as `to_netcdf`.
 
     Parameters
@@ -163,7 +161,7 @@ def to_zarr(
         long = long_variables(packed) if _rate(packed) is not None else {}
         encoding = _zarr_encoding(packed)
         rest = {name: options for name, options in encoding.items() if name not in long}
-        lazy = {name: packed[name].variable for name in rest if packed[name].chunks is not None}
+        lazy = {name: packed[name].variable for name in rest if packed[name].chunks is not None and "chunks" in encoding[name]}
         aligned = {name: v.chunk(dict(zip(v.dims, encoding[name]["chunks"], strict=True))) for name, v in lazy.items()}
         with new_output(path, overwrite=overwrite, directory=True) as temporary:
             whole = packed.drop_vars(long).assign(aligned)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -409,6 +411,64 @@ def test_counts_through_every_door(tmp_path):
             assert stored_kinds(path)["rate"] == kind, name
             with open_log(path) as back:
                 assert same_bits(back.rate, log.rate), name
+
+
+def test_ingest_writes_the_working_store(tmp_path, capsys):
+    from gyrostab.cli import main
+
+    source = write_csv(tmp_path / "a.csv", "gyro_x [deg/s],temperature [degC]", [np.arange(900.0) % 7, np.full(900, 20.5)])
+    assert main(["ingest", str(source), "-o", str(tmp_path / "log.zarr"), "--quiet-progress"]) == 0
+    assert main(["ingest", str(source), "-o", str(tmp_path / "log.nc"), "--compression", "zlib"]) == 0
+    assert main(["ingest", str(source), "-o", str(tmp_path / "b.zarr"), "--compression", "zlib"]) == 2
+    assert "--compression zlib is for NetCDF" in capsys.readouterr().err
+    for name in ("log.nc", "log.zarr"):
+        assert stored_kinds(tmp_path / name)["rate"] == "int16"
+        with open_log(tmp_path / name) as log:
+            np.testing.assert_array_equal(log.rate[0], np.arange(900) % 7 * 3600.0)
+
+
+def test_a_worker_of_a_cluster_tells_the_client(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    path = to_zarr(counts_log(samples=2 * CHUNK), tmp_path / "log.zarr")
+    spoil(path, 1, 1, how="remove")
+    settings = {"n_workers": 1, "threads_per_worker": 2, "processes": True, "dashboard_address": None, "memory_limit": 0}
+
+    def compute(client):
+        found = client.compute(log.rate.data).result()
+        time.sleep(1.0)  # the message takes its own way
+        return found
+
+    with distributed.LocalCluster(**settings) as cluster, distributed.Client(cluster) as client, open_log(path) as log:
+        with pytest.warns(UserWarning, match=r"axis y: the chunk from .* is missing: no file rate/1\.1"):
+            found = compute(client)
+        assert client.scheduler_info(n_workers=-1)["workers"]
+    assert np.isnan(found[1, CHUNK:]).all()
+    assert not np.isnan(found[1, :CHUNK]).any()
+
+
+@pytest.mark.parametrize("form", ["nc", "zarr", "csv"])
+def test_a_small_archive(tmp_path, form):
+    """The generator of `benchmarks`: files that overlap, gaps in and between them, the same from the same seed, one log when read."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    import make_archive
+
+    sys.path.pop(0)
+    options = {"hours": 0.1, "rate": 50, "axes": 2, "file-hours": 0.025, "gaps": 0.05, "overlap": "5s", "seed": 3, "scale": 0.02}
+    given = [f"--{name}={value}" for name, value in {**options, "format": form}.items()]
+    files = make_archive.main([str(tmp_path / "a"), *given])
+    make_archive.main([str(tmp_path / "b"), *given])
+    assert len(files) == 4
+    log, again = (gyrostab.regularise(gyrostab.read_log(sorted((tmp_path / name).iterdir()))) for name in "ab")
+    assert same_bits(log.rate, again.rate)
+    assert log.attrs["sampling_rate_hz"] == 50.0
+    assert 0.95 * 18_000 < log.sizes["time"] <= 18_000
+    present = log.rate.values[~np.isnan(log.rate.values)]
+    assert 0.90 < present.size / log.rate.size < 0.97
+    assert present.std() / 0.02 == pytest.approx(180, rel=0.05)
+    np.testing.assert_array_equal(np.rint(present / 0.02) * 0.02, present)
+    assert log.rate.encoding["scale_factor"] == 0.02
+    assert 300 < log.temperature.size < 400
+    assert (log.gap_samples.values > 0).sum() >= 4
 
 
 def test_chunks_of_slow_and_fast_logs():
