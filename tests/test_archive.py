@@ -111,7 +111,7 @@ def test_stored_pieces_in_any_order_give_back_the_whole(tmp_path: Path, suffix: 
     assert "2.0 s from 2026-03-01T10:00:38.000 are in 1" in said(joined)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_every_sample_that_some_piece_has_is_there_once(data: st.DataObject) -> None:
     size = data.draw(st.integers(300, 900), label="samples")
@@ -224,7 +224,7 @@ def test_a_slightly_different_clock_is_followed_sample_by_sample(ppm: float) -> 
     assert gap_table(joined)["samples"].sum() == np.isnan(expected).sum()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     off=st.floats(-0.5, 0.5), ratio=st.floats(-1e-2, 1e-2).map(lambda part: 1 + part), size=st.integers(1, 2000), first=st.integers(-9, 9)
 )
