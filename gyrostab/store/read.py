@@ -210,6 +210,8 @@ class _Chunks:
             except (OSError, KeyError) as error:
                 raise FormatError(f"{self.path}: cannot be opened again ({error}); has it been moved or changed?") from error
             variable.set_auto_maskandscale(False)
+            if variable.get_var_chunk_cache()[0]:
+                variable.set_var_chunk_cache(size=0)  # whole chunks are read once; 16 MiB in each file of an archive is much
             try:
                 return np.asarray(variable[begin:stop] if row is None else variable[row, begin:stop])
             except (OSError, RuntimeError) as error:
