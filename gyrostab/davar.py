@@ -27,7 +27,7 @@ from gyrostab.timegrid import first_stamp, grid_times
 __all__ = ["davar", "davar_part", "davar_parts"]
 
 #: Samples of a part up to which all its axes are read together.
-_TOGETHER = 2**24
+_TOGETHER = 2**21
 
 
 def davar(
