@@ -496,6 +496,15 @@ def test_window_means_are_the_design_times_the_parameters(table):
     np.testing.assert_allclose(total, means, atol=2e-3 * np.abs(means).max())
 
 
+def test_tilt_leaves_the_slope_of_the_acceleration_in_the_means():
+    effect = make_effect({"name": "real_motion", "x": 0.5, "z": -0.2, "direction": [1.0, -0.5, 0.2]})
+    rates = run(effect, size=4000, rate=10.0, drivers=DRIVERS)
+    windows, means = windows_of(rates, 10.0, 100, DRIVERS)
+    design = effect.explain(windows).mean
+    total = 0.5 * design["x"] - 0.2 * design["z"]
+    np.testing.assert_allclose(total[:, 1:-1], means[:, 1:-1], atol=0.02 * np.abs(means).max())
+
+
 @pytest.mark.parametrize(
     "table",
     [
