@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 import re
 import tomllib
 from dataclasses import replace
 from typing import Any
 
+import cloudpickle
+import dask
 import numpy as np
 import pytest
 import xarray as xr
@@ -21,9 +24,11 @@ from gyrostab.export import open_log, to_netcdf
 from gyrostab.log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.regularise import gap_table
+from gyrostab.run import load_log
 from gyrostab.schema import check_log
-from gyrostab.simulate import combine, drivers, read_model, simulate
+from gyrostab.simulate import combine, drivers, lazy, read_model, simulate
 from gyrostab.simulate import environment as env
+from gyrostab.simulate.lazy import Chain
 from gyrostab.simulate.losses import gaps, losses, power_cuts
 from gyrostab.simulate.model import PROFILES
 from gyrostab.timegrid import time_coordinate
@@ -464,3 +469,83 @@ def test_the_guide_lists_every_profile():
     text = (ROOT / "docs" / "simulate.md").read_text(encoding="utf-8")
     for name in PROFILES:
         assert f"`{name}`" in text
+
+
+# ----------------------------------------------------------------------------------------------------------------- blocks
+
+
+def test_a_chain_takes_each_step_once_and_goes_back_from_a_state_on_its_way():
+    taken: list[int] = []
+
+    def step(number: int, state: int) -> tuple[int, int]:
+        taken.append(number)
+        return 10 * state, state + number
+
+    chain = Chain(step, 1, 2000)
+    whole = [chain(number) for number in range(2000)]
+    assert taken == list(range(2000))
+    taken.clear()
+    assert chain(1001) == whole[1001]
+    assert len(taken) <= 4  # 2000 steps, 512 states
+    taken.clear()
+    assert [pickle.loads(pickle.dumps(Chain(_count, 1, 50)))(number) for number in (30, 7)] == [10 * (1 + 435), 10 * (1 + 21)]
+
+
+def _count(number: int, state: int) -> tuple[int, int]:
+    return 10 * state, state + number
+
+
+def test_blocks_in_any_order_from_any_thread_are_those_of_the_whole():
+    whole = simulate(model(), seed=2, chunk=100)
+    again = simulate(model(), seed=2, chunk=100)
+    backwards = [again.rate.data.blocks[0, k] for k in reversed(range(18))]
+    parts = dask.compute(*backwards, scheduler="threads", num_workers=4)
+    np.testing.assert_array_equal(np.concatenate(parts[::-1], axis=1), whole.rate.values)
+
+
+def test_a_copy_in_another_process_gives_the_same(monkeypatch):
+    monkeypatch.setattr(drivers, "SHORT", 100)  # channels that are read stretch by stretch travel too
+    log = simulate(model(), seed=2, chunk=300)
+    late = log.rate.data[:, 1500:].compute()
+    copy = cloudpickle.loads(cloudpickle.dumps(log.rate.data))
+    np.testing.assert_array_equal(copy[:, 1500:].compute(), late)
+
+
+def test_writing_in_pieces_makes_each_block_once(tmp_path, monkeypatch):
+    made: list[int] = []
+    step = lazy.next_block
+
+    def counted(plan, state, first, count, units, parts):
+        made.append(first)
+        return step(plan, state, first, count, units, parts)
+
+    monkeypatch.setattr(lazy, "next_block", counted)
+    log = simulate({"noise": {"N": 0.01}}, duration="1h", rate=100.0, chunk=6000)
+    for first in range(0, 360_000, 90_000):
+        log.rate.isel(time=slice(first, first + 90_000)).compute()
+    assert len(made) <= 60 + 3  # threads that come out of turn may make one again
+
+
+# ------------------------------------------------------------------------------------------------------------- recordings
+
+
+def test_like_a_real_recording(recordings, tmp_path):
+    """Stamps, gaps, restarts and channels are the recording's; the temperature it measured drives an effect."""
+    path = recordings("fog-hybrid-warmup/run1_static.txt")
+    names = {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z", "Tx": "temperature"}
+    units = {"gyro": "deg/s", "time": "s", "temperature": "degC"}
+    recorded = load_log([path], map=names, unit=units)
+    toml = tmp_path / "m.toml"
+    toml.write_text("[noise]\nN = 0.01\n[[effect]]\nname = 'temperature_bias'\nsensitivity = 2\naxes = 'z'\n")
+    out = tmp_path / "twin.nc"
+    given = [word for key, value in names.items() for word in ("--map", f"{key}={value}")]
+    given += [word for key, value in units.items() for word in ("--unit", f"{key}={value}")]
+    assert main(["simulate", str(toml), "-o", str(out), "--like", str(path), *given, "--quiet-progress"]) == 0
+    twin = open_log(out)
+    np.testing.assert_array_equal(twin.time.values, recorded.time.values)
+    np.testing.assert_array_equal(np.isnan(twin.rate.values), np.isnan(recorded.rate.values))
+    np.testing.assert_array_equal(twin.temperature.values, recorded.temperature.values)
+    restarts = gap_table(recorded).query("cause == 'restart'")
+    assert gap_table(twin).query("cause == 'restart'").start.tolist() == restarts.start.tolist()
+    bias = davar(twin, window="20s", step="20s", taus=[1.0])
+    np.testing.assert_allclose(bias.window_mean.sel(axis="z"), 2 * (bias.temperature - 25), atol=1.0)

@@ -61,6 +61,10 @@ class Chain:
                     self._forget(place)
             return self._recent[number]
 
+    def go(self, number: int) -> Any:
+        """Take a step and give its result, unless it was taken already; then give None."""
+        return self(number) if max(self._states) <= number else None
+
     def _forget(self, place: int) -> None:
         while len(self._recent) > RECENT:
             del self._recent[next(iter(self._recent))]
@@ -115,15 +119,19 @@ class _Log:
             parts[name] = (stretch, channel(stretch))
         return next_block(self.plan, state, first, count, [one(number) for one in self.draws], parts)
 
-    def __call__(self, number: int) -> NDArray[np.float64]:
-        """Rates of a block; two threads with neighbouring blocks draw for different axes at the same time."""
-        for one in self.draws:
-            one(number)
-        return np.asarray(self.blocks(number))
+
+def _go_draw(log: _Log, row: int, number: int, *before: Any) -> None:
+    """Draw a block of an axis; what comes before holds it back, so that blocks come in their order and not far ahead of their use."""
+    log.draws[row].go(number)
 
 
-def _rates(log: _Log, number: int) -> NDArray[np.float64]:
-    return log(number)
+def _go_block(log: _Log, number: int, *before: Any) -> Any:
+    """Rates of a block; None if it was made before."""
+    return log.blocks.go(number)
+
+
+def _rates(log: _Log, number: int, made: Any) -> NDArray[np.float64]:
+    return np.asarray(log.blocks(number) if made is None else made)
 
 
 def lazy_rates(plan: Plan, state: BlockState, starts: Sequence[NoiseState], size: int, *, chunk: int) -> Any:
@@ -152,6 +160,14 @@ def lazy_rates(plan: Plan, state: BlockState, starts: Sequence[NoiseState], size
     counts = tuple(min(chunk, size - first) for first in range(0, size, chunk))
     token = f"{np.random.default_rng().integers(2**62):x}"
     name, log = f"simulated-rate-{token}", f"simulation-{token}"
-    tasks: dict[Any, Any] = {(name, 0, number): (_rates, log, number) for number in range(len(counts))}
-    tasks[log] = _Log(plan, state, starts, counts)
+    tasks: dict[Any, Any] = {log: _Log(plan, state, starts, counts)}
+    rows = range(len(starts))
+    for number in range(len(counts)):
+        earlier = [(f"{log}-block", number - 1)] if number else []
+        for row in rows:
+            before = [(f"{log}-draw", row, number - 1)] if number else []
+            gate = [(f"{log}-block", number - RECENT)] if number >= RECENT else []
+            tasks[(f"{log}-draw", row, number)] = (_go_draw, log, row, number, *before, *gate)
+        tasks[(f"{log}-block", number)] = (_go_block, log, number, *earlier, *((f"{log}-draw", row, number) for row in rows))
+        tasks[(name, 0, number)] = (_rates, log, number, (f"{log}-block", number))
     return da.Array(HighLevelGraph.from_collections(name, tasks), name, chunks=((len(plan.axes),), counts), dtype=np.float64)
