@@ -22,7 +22,6 @@ __all__ = ["Pool", "check_scheduler", "in_any_order", "open_pool"]
 
 _TIMEOUT = 20.0  # s, for a scheduler to answer and for a first worker to come
 _PATIENCE = 60.0  # s without any worker
-_RETRIES = 5  # deaths of workers on one and the same part
 
 
 class Pool(NamedTuple):
@@ -158,7 +157,7 @@ def _cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
                 f"--scheduler {address}: the scheduler has no workers; start some with 'dask worker {address} --nthreads 1'"
             ) from error
         _check_workers(client, address, files)
-        executor = client.get_executor(pure=False, retries=_RETRIES)
+        executor = client.get_executor(pure=False)
         try:
             threads = lambda: sum(client.nthreads().values())  # noqa: E731
             yield Pool(executor.submit, threads, True, partial(client.submit, _same, pure=False))

@@ -221,6 +221,11 @@ def test_a_worker_process_that_dies_is_explained():
         list(in_any_order(pool, [(os._exit, 3)]))
 
 
+def test_a_part_that_kills_every_worker_is_explained(address):
+    with open_pool(address) as pool, pytest.raises(WorkerError, match="died again and again on the same part"):
+        list(in_any_order(pool, [(os._exit, 3)]))
+
+
 def test_worker_processes_end_with_a_killed_parent(tmp_path):
     code = (
         "import os, signal\n"
