@@ -75,7 +75,6 @@ def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
     """Put arrays that know about damage in place of the long variables of a log."""
     import dask.array as da
 
-    file = None if path.is_dir() else _shared_file(path)
     labels = [str(label) for label in stored["axis"].values]
     opened = uuid.uuid4().hex
     long: dict[Any, xr.Variable] = {}
@@ -85,11 +84,11 @@ def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
         chunks = disk.get("chunks" if path.is_dir() else "chunksizes")
         if not dim.startswith("time") or variable.dtype.kind != "f" or not variable.size or chunks is None:
             continue
-        own = all(size == 1 for size in chunks[:-1]) and (file is not None or _is_plain(path / str(name)))
+        own = all(size == 1 for size in chunks[:-1]) and (not path.is_dir() or _is_plain(path / str(name)))
         if not own or ("scale_factor" in disk and "_FillValue" not in disk):
             continue  # some other program has laid it out anew
         array = _Chunks(
-            path=path,
+            path=path.absolute(),
             name=str(name),
             rows=tuple(f"axis {label}" for label in labels) if variable.ndim == 2 else (f"channel {name}",),
             shape=variable.shape,
@@ -100,7 +99,7 @@ def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
             spans=_spans(stored, dim, int(chunks[-1])),
             strict=strict,
             opened=opened,
-            file=file,
+            zarr=path.is_dir(),
         )
         meta = np.empty((0,) * variable.ndim, variable.dtype)
         lazy = da.from_array(
@@ -114,19 +113,19 @@ def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
     def close_all() -> None:
         if close is not None:
             close()
-        if file is not None:
-            file.close()
+        with library_lock():
+            _opened.cache_clear()
 
     log.set_close(close_all)
     return log
 
 
-def _shared_file(path: Path) -> Any:
-    """A NetCDF file that is opened when it is needed, once in each process, and travels between processes as its name."""
+@lru_cache(maxsize=8)
+def _opened(path: Path, opened: str) -> Any:
+    """The file, open: once in each process for one opening of a log, and only the last few, as each takes megabytes of the library."""
     import netCDF4
-    from xarray.backends import CachingFileManager
 
-    return CachingFileManager(netCDF4.Dataset, str(path.absolute()), mode="r", lock=library_lock())
+    return netCDF4.Dataset(path)
 
 
 def _is_plain(folder: Path) -> bool:
@@ -167,7 +166,7 @@ class _Chunks:
     spans: dict[str, Any] | tuple[tuple[int, int], ...]
     strict: bool
     opened: str
-    file: Any
+    zarr: bool
 
     @property
     def ndim(self) -> int:
@@ -187,7 +186,7 @@ class _Chunks:
             number = begin // self.length
             stop = min(end, (number + 1) * self.length)
             try:
-                pieces.append(self._decoded(self._zarr(row, number, begin, stop) if self.file is None else self._netcdf(row, begin, stop)))
+                pieces.append(self._decoded(self._zarr(row, number, begin, stop) if self.zarr else self._netcdf(row, begin, stop)))
             except _Damage as damage:
                 self._tell(row or 0, number, str(damage))
                 pieces.append(np.full(stop - begin, np.nan, self.dtype))
@@ -206,7 +205,7 @@ class _Chunks:
     def _netcdf(self, row: int | None, begin: int, stop: int) -> NDArray[Any]:
         with library_lock():
             try:
-                variable = self.file.acquire(needs_lock=False).variables[self.name]
+                variable = _opened(self.path, self.opened).variables[self.name]
             except (OSError, KeyError) as error:
                 raise FormatError(f"{self.path}: cannot be opened again ({error}); has it been moved or changed?") from error
             variable.set_auto_maskandscale(False)
