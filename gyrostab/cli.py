@@ -388,7 +388,8 @@ def export(
     from gyrostab.kalibr import to_kalibr
     from gyrostab.run import check_output
 
-    write, suffixes = {"kalibr": (to_kalibr, [".yaml", ".yml"]), "zarr": (to_zarr, [".zarr"])}[format]
+    writers: dict[str, tuple[Any, list[str]]] = {"kalibr": (to_kalibr, [".yaml", ".yml"]), "zarr": (to_zarr, [".zarr"])}
+    write, suffixes = writers[format]
     target = check_output(output, suffixes=suffixes, overwrite=common.overwrite, inputs=[product])
     with _work(common) as stage:
         stage("writing", 0)
