@@ -125,7 +125,7 @@ def _opened(path: Path, opened: str) -> Any:
     """The file, open: once in each process for one opening of a log, and only the last few, as each takes megabytes of the library."""
     import netCDF4
 
-    return netCDF4.Dataset(path)
+    return netCDF4.Dataset(path, keepweakref=True)  # closes when it falls out of the cache
 
 
 def _is_plain(folder: Path) -> bool:
