@@ -172,6 +172,16 @@ def test_a_channel_in_the_wrong_unit_is_refused():
         simulate(model(environment=wrong, effect=BIASED[:1]))
 
 
+def test_units_of_one_quantity_are_converted():
+    """A rate in deg/h drives what wants deg/s."""
+    turning = make_log(np.zeros((3, 100)), rate=10.0, unit="deg/h").assign(
+        spin=("time", np.full(100, 3600.0 * 90.0), {"units": "degree hour-1"})
+    )
+    effect = [{"name": "scale_factor", "linear": 100.0, "driver": ["spin", "temperature"]}]
+    scaled = simulate({"effect": effect}, like=turning)
+    np.testing.assert_allclose(scaled.rate, 90 * 3600 * 1e-4, rtol=1e-9)
+
+
 def test_a_channel_may_have_another_name():
     world = [{"profile": "steps", "channel": "coil_temperature", "unit": "degC", "points": [[0, 75]]}]
     effect = [{"name": "temperature_bias", "sensitivity": 0.1, "driver": "coil_temperature"}]
@@ -290,6 +300,12 @@ def test_toolface_is_the_integral_of_the_rate(stick_slip):
     np.testing.assert_allclose(turning.accel_y.values, -np.sin(np.radians(angle)), atol=1e-5)
     assert rate.min() >= 0.0
     np.testing.assert_allclose(turning.accel_z.values, 0.0, atol=1e-12)
+
+
+def test_a_tool_that_hangs_plumb_feels_gravity_on_its_axis():
+    still = env.rotation([[0, 0]], duration=1.0, inclination=0.0)
+    assert (still.accel_z.values == -1.0).all()  # z points down; what holds the tool pushes up
+    np.testing.assert_allclose(still.accel_x.values, 0.0, atol=1e-15)
 
 
 def test_light_power_is_a_loss_in_decibel():

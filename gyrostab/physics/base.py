@@ -229,7 +229,7 @@ class Prediction:
         Parameter -> window mean per unit of it [degree hour-1 per unit].
     level : mapping of (str, str) to ndarray, shape (window,) or (axis, window)
         (symbol of the noise term, parameter) -> change of the term's squared coefficient per unit, as a share of it.
-    spectrum : mapping of str to ndarray, shape (window, band)
+    spectrum : mapping of str to ndarray, shape (window, band) or (axis, window, band)
         Parameter -> added two-sided power spectral density per unit of its square [degree2 hour-2 Hz-1].
     response : ndarray, shape (band,), or None
         Squared magnitude by which the whole spectrum is multiplied (a filter).

@@ -23,11 +23,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Step:
-    """One effect in its place."""
+    """One effect in its place: rows of its axes, and factors from the units of its channels to those that it needs."""
 
     effect: Effect
     setup: Setup
     rows: tuple[int, ...]
+    factors: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,8 @@ def next_block(
     def act(number: int, fast: bool = True, **given: Any) -> tuple[Step, Any]:
         step = plan.steps[number]
         size, skip = (index.size, 1) if fast else (count, factor)
-        drivers = {role: channels[name][::skip] for role, name in step.effect.channel_names().items() if role in step.effect.needs()}
+        names = step.effect.channel_names()
+        drivers = {role: channels[names[role]][::skip] * step.factors.get(role, 1.0) for role in step.effect.needs()}
         chunk = Chunk(setup=step.setup, first=first * (factor // skip), size=size, drivers=drivers, **given)
         values, state.effects[number] = step.effect.generate(chunk, state.effects[number])
         return step, values

@@ -43,6 +43,8 @@ def inner_unit(unit: str, values: Any) -> tuple[str, Any]:
         known = parse_unit(unit)
     except ValueError:
         return unit, values
+    if known.quantity == "rate":  # of a tool, not of a gyro's output
+        return INNER["rotation_rate"], np.asarray(values) * (known.factor / parse_unit(INNER["rotation_rate"]).factor)
     return INNER[known.quantity], np.asarray(values) * known.factor + known.offset
 
 

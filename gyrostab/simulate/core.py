@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.clock import time_of_day
-from gyrostab.errors import OptionError, SchemaError
+from gyrostab.errors import OptionError, SchemaError, UnitError
 from gyrostab.gaps import gap_variables
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
@@ -26,6 +27,7 @@ from gyrostab.simulate.lazy import lazy_rates
 from gyrostab.simulate.model import PROFILES, Model, read_model
 from gyrostab.simulate.noise import begin_noise, stream
 from gyrostab.timegrid import first_stamp, grid_index, time_coordinate
+from gyrostab.units import parse_unit
 from gyrostab.windows import duration_seconds
 
 __all__ = ["simulate"]
@@ -217,27 +219,36 @@ def _steps(model: Model, frame: _Frame, table: NDArray[np.int64]) -> list[Step]:
     return check_effects(steps)
 
 
+def _factors(effect: Effect, world: xr.Dataset, present: list[str]) -> dict[str, float]:
+    """Factors from the units of an effect's channels to those that it needs; `SchemaError` where a channel or its unit is wrong."""
+    factors = {}
+    names = effect.channel_names()
+    for role in effect.needs():
+        if names[role] not in present:
+            raise driver_error(effect, role, present)
+        wanted, found = effect.channels[role], str(world[names[role]].attrs.get("units"))
+        if found == wanted:
+            continue
+        with contextlib.suppress(UnitError):
+            one, other = parse_unit(found), parse_unit(wanted)
+            if one.quantity == other.quantity and one.offset == other.offset:
+                factors[role] = one.factor / other.factor
+                continue
+        raise SchemaError(f"effect {effect.name!r} needs {names[role]!r} in {wanted}; the channel is in {found!r}")
+    return factors
+
+
 def _plan(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], steps: list[Step]) -> Plan:
     present = log_channels(world)
-    needed: dict[str, Effect | None] = {}
-    for step in steps:
-        names = step.effect.channel_names()
-        for role in step.effect.needs():
-            if names[role] not in present:
-                raise driver_error(step.effect, role, present)
-            units = world[names[role]].attrs.get("units")
-            if units != step.effect.channels[role]:
-                raise SchemaError(
-                    f"effect {step.effect.name!r} needs {names[role]!r} in {step.effect.channels[role]}; the channel is in {units!r}"
-                )
-            needed[names[role]] = step.effect
+    steps = [replace(step, factors=_factors(step.effect, world, present)) for step in steps]
+    needed = {step.effect.channel_names()[role] for step in steps for role in step.effect.needs()}
     turning = str(world["rotation_rate"].attrs.get("rotation_axis", "")) if "rotation_rate" in present else ""
     if turning and turning not in frame.axes:
         raise OptionError(
             f"{model.source}: the tool turns about the axis {turning!r}, which the log has not; it has {', '.join(frame.axes)}"
         )
     if turning:
-        needed["rotation_rate"] = None
+        needed.add("rotation_rate")
     return Plan(
         rate=frame.rate,
         oversampling=frame.oversampling,
@@ -245,7 +256,7 @@ def _plan(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int6
         axes=frame.axes,
         coefficients=tuple(model.coefficients(axis) for axis in frame.axes),
         steps=tuple(steps),
-        sources={name: make_source(world, name) for name in needed},
+        sources={name: make_source(world, name) for name in sorted(needed)},
         turning=turning,
         gaps=table[:, :2],
     )

@@ -308,7 +308,8 @@ def rotation(
     Returns
     -------
     xarray.Dataset
-        ``rotation_rate`` [degree s-1], ``toolface`` [degree, 0 to 360], accelerations [g].
+        ``rotation_rate`` [degree s-1], ``toolface`` [degree, 0 to 360], and what accelerometers at rest in the tool read [g]: z points
+        down the hole, x to the high side at toolface 0, and the tool turns clockwise looking down.
 
     Examples
     --------
@@ -333,7 +334,7 @@ def rotation(
         made |= {
             "accel_x": ("g", lambda t: math.sin(tilt) * np.cos(face(t)), {}),
             "accel_y": ("g", lambda t: -math.sin(tilt) * np.sin(face(t)), {}),
-            "accel_z": ("g", lambda t: np.full(t.shape, math.cos(tilt)), {}),
+            "accel_z": ("g", lambda t: np.full(t.shape, -math.cos(tilt)), {}),
         }
     timing: dict[str, Any] = {"duration": duration, "start": start, "sensor_rate": sensor_rate}
     return combine(*(channel(name, unit, values, attributes=more, **timing) for name, (unit, values, more) in made.items()))
