@@ -23,7 +23,7 @@ from gyrostab.export import open_log, open_product, open_surface, to_netcdf
 from gyrostab.read.buffers import Buffers
 from gyrostab.run import load_log
 
-COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "report", "plot", "export")
+COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "report", "plot", "export", "simulate")
 RATE = 100
 N_TRUE = 0.02  # deg/sqrt(h)
 
