@@ -1,4 +1,4 @@
-"""Effects of temperature on the bias."""
+"""Effects of temperature on the bias: by itself, by its change, its differences and its history."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Stage, Windows, parameter
+import numpy as np
+
+from gyrostab.errors import OptionError
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
 from gyrostab.units import INNER
 
-__all__ = ["TemperatureBias"]
+__all__ = ["Shupe", "TemperatureBias", "ThermalGradient", "ThermalHysteresis"]
+
+_MINUTE = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,3 +67,242 @@ class TemperatureBias(Effect):
         """Say it in one sentence."""
         terms = [self.quantity(name, errors) for name in self.size_parameters if name == "sensitivity" or getattr(self, name)]
         return f"The bias follows the temperature {self.on_axes()}, by {', '.join(terms)} around {self.quantity('reference')}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shupe(Effect):
+    """Bias that follows the change of the temperature as the coil feels it.
+
+    ``b = s h * dT/dt + r d/dt (T_outer - T_inner)``
+
+    The coil is a winding that is heated from outside (T) and insulated inside. h is how the mean of the winding follows its surface: a sum
+    of diffusion modes of the times ``lag / (2 n - 1)^2``, the slowest ``lag = 4 d^2 / (pi^2 kappa)`` for the thickness d. s is what is
+    left of the winding's asymmetry, pure and elasto-optic in one; r what the outer half of the layers does against the inner one, while
+    heat is on its way.
+
+    *DAVAR*: nothing at a steady ramp, for the bias is constant. Where a ramp of the rate v begins or ends the bias moves by s v within
+    the lag: K = s v / sqrt(W) in windows W much longer than the lag, R of about s v / lag in short ones. *Window mean*: a plateau s v while
+    ramping, then an exponential return; odd in the direction.
+    *Spectrum*: f^2 times that of the temperature, below the lag. *Axes*: each coil has its own size and sign.
+
+    Confused with temperature_bias (even: the same on the way up and down), warm_up (starts with the power, not with the temperature
+    outside), thermal_hysteresis (stays on a plateau) and thermal_gradient (a second sensor decides). A ramp up, a plateau and a ramp down
+    separate them, by regression on T and on dT/dt at several lags together.
+
+    References
+    ----------
+    Shupe 1980, Appl. Opt. 19, 654; Mohr and Schadt 2004, Proc. SPIE 5502, 410 (elasto-optic part); Senol et al. 2024, Sci. Rep. (0.05 deg/h
+    left at any ramp after trimming); Carslaw and Jaeger 1959 (the modes). A winding of 12 mm with kappa = 2.2e-7 m^2/s has a lag of
+    265 s (estimate); a coil of 500 m and 4 cm whose halves differ by 0.1 % of a ramp of 1 degC/min reads about 0.3 deg/h.
+
+    Examples
+    --------
+    >>> Shupe(sensitivity=0.05, axes=["x"]).say()
+    'The bias follows the change of the temperature on axis x, by 0.05 deg/h/(degC/min) with a lag of 265 s.'
+    """
+
+    name: ClassVar[str] = "shupe"
+    short: ClassVar[str] = "bias follows (lagged) dT/dt"
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
+    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "transient")
+    references: ClassVar[tuple[str, ...]] = (
+        "Shupe 1980, Appl. Opt. 19, 654",
+        "Mohr and Schadt 2004, Proc. SPIE 5502, 410",
+        "Senol et al. 2024, Sci. Rep.",
+    )
+
+    sensitivity: float = parameter(
+        "deg/h/(degC/min)", "bias at a steady ramp", typical=0.05, low=-1e3, high=1e3, source="Senol et al. 2024"
+    )
+    transient: float = parameter(
+        "deg/h/(degC/min)", "bias per difference of ramps, outer minus inner half", default=0.0, typical=0.3, low=-1e3, high=1e3
+    )
+    lag: float = parameter("s", "relaxation time of the slowest mode", default=265.0, low=1e-3, high=1e6)
+    modes: float = parameter("1", "number of modes; 1 for a simple lag", default=5.0, low=1.0, high=50.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.modes != int(self.modes):
+            raise OptionError(f"effect {self.name!r}, parameter 'modes': {self.modes:g} is not a whole number of modes; give one")
+        if self.transient and self.modes < 2:
+            raise OptionError(f"effect {self.name!r}: transient needs at least 2 modes, for one mode has no outer and inner half")
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """No heat on its way."""
+        return None
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        from gyrostab.kernels.thermal import relax, slab
+
+        temperature = chunk.drivers["temperature"]
+        if not chunk.size:
+            return np.zeros(0), state
+        times, whole, halves = slab(self.lag, int(self.modes))
+        before = (float(temperature[0]), np.zeros(times.size)) if state is None else state
+        felt, state = relax(temperature, chunk.rate, times, np.stack([whole, halves]), before)
+        return _MINUTE * (self.sensitivity * felt[0] + self.transient * felt[1]), state
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """Lags from simple sensors to thick windings."""
+        return {"lag": np.geomspace(30.0, 3000.0, 9)}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means, from the window means of the temperature joined by straight lines."""
+        from gyrostab.kernels.thermal import slab
+
+        times, whole, halves = slab(self.lag, int(self.modes))
+        modes = np.stack([_felt(windows, windows.drivers["temperature"], float(time)) for time in times])
+        return Prediction(mean={"sensitivity": whole @ modes, "transient": halves @ modes})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        more = f" and {self.quantity('transient', errors)} while heat goes through the winding" if self.transient else ""
+        size = f"{self.quantity('sensitivity', errors)}{more} with a lag of {self.quantity('lag', errors)}"
+        return f"The bias follows the change of the temperature {self.on_axes()}, by {size}."
+
+
+def _felt(windows: Windows, values: Array, lag: float) -> Array:
+    """Window means of a delayed rate of change [unit of the values min-1]."""
+    from gyrostab.kernels.thermal import mean_changes
+
+    return _MINUTE * mean_changes(windows.centre, values, windows.begin, windows.end, lag)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThermalGradient(Effect):
+    """Bias that follows the difference of two temperatures, or its change.
+
+    ``b = s (T1 - T2) + r h * d(T1 - T2)/dt``, h a lag
+
+    *DAVAR*: nothing at a steady gradient, R while it builds up, K-like in windows longer than that. *Window mean*: follows the
+    difference: zero on plateaus, a plateau at steady ramps, with the lag between both sensors. *Spectrum*: that of the difference.
+    *Axes*: often of opposite sign on axes mounted the other way round.
+
+    Confused with shupe, which looks the same where one of the temperatures follows the other with a lag: only a second sensor, and heat
+    that comes from another side (electronics, circulation), separate them. With one sensor both belong to the answer.
+
+    References
+    ----------
+    Zhuo and Du, multidimensional thermal field of quadrupole coils; Jo et al., J. Korea Inst. Mil. Sci. Technol. (bias by the changes of
+    temperature and of its gradient, three times smaller after compensation). Sizes are estimates: 0.01 to 1 deg/h/degC.
+
+    Examples
+    --------
+    >>> ThermalGradient(sensitivity=0.05, axes=["x"]).say()
+    'The bias follows the difference of temperature and temperature_2 on axis x, by 0.05 deg/h/degC.'
+    """
+
+    name: ClassVar[str] = "thermal_gradient"
+    short: ClassVar[str] = "bias follows a difference of two temperatures"
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = dict.fromkeys(("temperature", "temperature_2"), INNER["temperature"])
+    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "change")
+    references: ClassVar[tuple[str, ...]] = (
+        "Zhuo and Du, multidimensional thermal field of quadrupole coils",
+        "Jo et al., J. Korea Inst. Mil. Sci. Technol.",
+    )
+
+    sensitivity: float = parameter("deg/h/degC", "bias per difference", default=0.0, typical=0.05, low=-1e3, high=1e3)
+    change: float = parameter("deg/h/(degC/min)", "bias per change of the difference", default=0.0, typical=0.1, low=-1e3, high=1e3)
+    lag: float = parameter("s", "lag of that change", default=60.0, low=1e-3, high=1e6)
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """No change before the start."""
+        return None
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        from gyrostab.kernels.thermal import relax
+
+        difference = chunk.drivers["temperature"] - chunk.drivers["temperature_2"]
+        if not (self.change and chunk.size):
+            return self.sensitivity * difference, state
+        before = (float(difference[0]), np.zeros(1)) if state is None else state
+        felt, state = relax(difference, chunk.rate, np.array([self.lag]), np.ones((1, 1)), before)
+        return self.sensitivity * difference + _MINUTE * self.change * felt[0], state
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """Lags of the change."""
+        return {"lag": np.geomspace(10.0, 1000.0, 5)}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means of the difference and of its change."""
+        difference = windows.drivers["temperature"] - windows.drivers["temperature_2"]
+        return Prediction(mean={"sensitivity": difference, "change": _felt(windows, difference, self.lag)})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        terms = [self.quantity("sensitivity", errors)] if self.sensitivity or not self.change else []
+        if self.change:
+            terms.append(f"{self.quantity('change', errors)} of its change, with a lag of {self.quantity('lag', errors)}")
+        return f"The bias follows the difference of {' and '.join(self.channel_names().values())} {self.on_axes()}, by {', '.join(terms)}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThermalHysteresis(Effect):
+    """Bias that depends on the way that the temperature came.
+
+    ``b = a (T - H)``, H the play of half-width w: a slider that T drags along, and that stands while T moves inside of its play
+
+    So b goes from -a w on the way down to a w on the way up, over the first 2 w after a turn, whatever the speed; at the start it is zero.
+
+    *DAVAR*: an apparent R of ``a dT/dt`` over the first 2 w after a turn and nothing beyond; in long windows a step of 2 a w. *Window
+    mean*: a loop over T of the area ``2 a w (range - 2 w)``, run through in one direction. *Spectrum*: that of slow steps. *Axes*: each
+    has its own size and sign.
+
+    Confused with shupe (goes back on a plateau; this one stays) and ageing_bias (comes not back in a closed cycle): hold the temperature,
+    and run closed cycles at two speeds.
+
+    References
+    ----------
+    Zhou et al. 2025, Micromachines 16, 357 (hysteresis of resonator gyros over temperature). Sizes are estimates: a play of 1 to 10 degC,
+    10 to 50 % of what the temperature does by itself.
+
+    Examples
+    --------
+    >>> ThermalHysteresis(sensitivity=3e-4, width=4, axes=["x"]).say()
+    'The bias depends on the way the temperature came on axis x, by 0.0003 deg/h/degC within a play of 4 degC to each side.'
+    """
+
+    name: ClassVar[str] = "thermal_hysteresis"
+    short: ClassVar[str] = "bias depends on the history of T"
+    stage: ClassVar[Stage] = "rate"
+    channels: ClassVar[Mapping[str, str]] = {"temperature": INNER["temperature"]}
+    size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
+    references: ClassVar[tuple[str, ...]] = ("Zhou et al. 2025, Micromachines 16, 357",)
+
+    sensitivity: float = parameter("deg/h/degC", "bias per degree inside of the play", typical=3e-4, low=-10.0, high=10.0)
+    width: float = parameter("degC", "half of the play", default=3.0, low=0.0, high=500.0)
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """The slider will start at the first temperature."""
+        return None
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        from gyrostab.kernels.thermal import play
+
+        temperature = np.ascontiguousarray(chunk.drivers["temperature"])
+        if not chunk.size:
+            return np.zeros(0), state
+        slider, state = play(temperature, self.width, float(temperature[0]) if state is None else state)
+        return self.sensitivity * (temperature - slider), state
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """Plays up to a third of the range of the temperature."""
+        return {"width": np.ptp(windows.drivers["temperature"]) * np.array([0.01, 0.03, 0.1, 0.2, 0.33])}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means, with the play run by the window means of the temperature in the order of the windows."""
+        from gyrostab.kernels.thermal import play
+
+        temperature = np.ascontiguousarray(windows.drivers["temperature"])
+        slider, _ = play(temperature, self.width, float(temperature[0]))
+        return Prediction(mean={"sensitivity": temperature - slider})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        size = f"{self.quantity('sensitivity', errors)} within a play of {self.quantity('width', errors)} to each side"
+        return f"The bias depends on the way the temperature came {self.on_axes()}, by {size}."

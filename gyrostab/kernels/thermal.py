@@ -1,0 +1,184 @@
+"""What temperature leaves behind in a body: diffusion through a coil, and play.
+
+A winding of thickness d, insulated on one side and heated on the other, follows its surface with modes of the relaxation times
+``t_n = 4 d^2 / ((2 n - 1)^2 pi^2 kappa)``. All processes go on where they stopped, bit for bit, however time is cut into calls.
+
+References
+----------
+Carslaw and Jaeger 1959, Conduction of Heat in Solids, section 3.4 (slab with one insulated face).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["mean_changes", "play", "relax", "slab"]
+
+Array = NDArray[np.float64]
+
+#: Smaller numbers are zero: the processor is slow with those that it cannot normalise.
+TINY = 1e-200
+
+
+def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
+    """Modes of a winding that is heated from outside.
+
+    Parameters
+    ----------
+    slowest : float
+        Relaxation time of the slowest mode [s].
+    count : int
+        Number of modes; the last one stands for all that are faster.
+
+    Returns
+    -------
+    times : ndarray, shape (count,)
+        Relaxation times [s], falling.
+    whole : ndarray, shape (count,)
+        Share of each mode in how the mean of the winding follows; their sum is one.
+    halves : ndarray, shape (count,)
+        The same for the outer half minus the inner half; their sum is zero.
+
+    Examples
+    --------
+    >>> times, whole, halves = slab(265.0, 3)
+    >>> times.round(1), whole.round(3), halves.round(3)
+    (array([265. ,  29.4,  10.6]), array([0.811, 0.09 , 0.099]), array([-0.671,  0.435,  0.237]))
+    """
+    odd = 2.0 * np.arange(1, count + 1) - 1.0
+    root = odd * math.pi / 2.0
+    sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
+    whole = 2.0 / root**2
+    halves = 4.0 * sign * (sign - 2.0 * np.sin(root / 2.0)) / root**2
+    whole[-1] += 1.0 - whole.sum()
+    halves[-1] -= halves.sum()
+    times: Array = slowest / odd**2
+    return times, whole, halves
+
+
+@njit(cache=True, nogil=True)
+def _relax(change: Array, decay: Array, gain: Array, weight: Array, carry: Array) -> tuple[Array, Array]:
+    size, count = change.size, decay.size
+    total = np.empty((weight.shape[0], size))
+    here = carry.copy()
+    for i in range(size):
+        for k in range(count):
+            value = decay[k] * here[k] + gain[k] * change[i]
+            here[k] = 0.0 if abs(value) < TINY else value
+        for row in range(weight.shape[0]):
+            value = 0.0
+            for k in range(count):
+                value += weight[row, k] * here[k]
+            total[row, i] = value
+    return total, here
+
+
+def relax(values: Array, rate: float, times: Array, weight: Array, carry: tuple[float, Array]) -> tuple[Array, tuple[float, Array]]:
+    """Rate of change of samples, delayed by every mode: ``v' = (T' - v) / t``, T straight between its samples.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        T at the samples.
+    rate : float
+        Sampling rate [Hz].
+    times : ndarray, shape (m,)
+        Relaxation times [s].
+    weight : ndarray, shape (k, m)
+        Sums over modes that are wanted.
+    carry : (float, ndarray of shape (m,))
+        T and v at the sample before; at the start the first T and zeros.
+
+    Returns
+    -------
+    rates : ndarray, shape (k, n)
+        Sums of v at the samples [unit of T s-1].
+    carry : (float, ndarray)
+    """
+    last, position = carry
+    change = np.diff(values, prepend=last) * rate
+    total, position = _relax(change, np.exp(-1.0 / (rate * times)), -np.expm1(-1.0 / (rate * times)), weight, position)
+    return total, (float(values[-1]), position)
+
+
+@njit(cache=True, nogil=True)
+def _follow(at: Array, values: Array, time: float) -> Array:
+    behind = 0.0
+    out = np.empty(at.size)
+    out[0] = values[0]
+    for i in range(1, at.size):
+        step = at[i] - at[i - 1]
+        if step > 0.0:
+            slope = (values[i] - values[i - 1]) / step
+            kept = math.exp(-step / time)
+            behind = behind * kept + slope * time * (1.0 - kept)
+        out[i] = values[i] - behind
+    return out
+
+
+def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
+    """Mean over intervals of what `relax` gives for one mode, from a few values of T that are joined by straight lines.
+
+    Parameters
+    ----------
+    known : ndarray, shape (n,)
+        Times of the values, rising [s].
+    values : ndarray, shape (n,)
+        T; beyond the ends it goes on as in the outermost intervals.
+    begin, end : ndarray, shape (w,)
+        Edges of the intervals [s]; T stood still before the first of them.
+    time : float
+        Relaxation time [s].
+
+    Returns
+    -------
+    ndarray, shape (w,)
+        Means of v [unit of T s-1].
+
+    Examples
+    --------
+    >>> mean_changes(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.01)
+    array([0.1998, 0.2   ])
+    """
+    at = np.unique(np.concatenate([known, begin, end]))
+    line = np.interp(at, known, values)
+    if known.size > 1:
+        for edge, one, other in ((at < known[0], 0, 1), (at > known[-1], -1, -2)):
+            slope = (values[one] - values[other]) / (known[one] - known[other])
+            line[edge] = values[one] + slope * (at[edge] - known[one])
+    followed = _follow(at, line, time)
+    return np.asarray((followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin))
+
+
+@njit(cache=True, nogil=True)
+def play(values: Array, width: float, start: float) -> tuple[Array, float]:
+    """Play of half-width `width`: a slider that is dragged along by `values` and stands while they move inside of its play.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+    width : float
+        Half of the play.
+    start : float
+        Slider before the first value.
+
+    Returns
+    -------
+    slider : ndarray, shape (n,)
+    last : float
+
+    Examples
+    --------
+    >>> play(np.array([0.0, 5.0, 4.0, 0.0, -5.0]), 2.0, 0.0)
+    (array([ 0.,  3.,  3.,  2., -3.]), -3.0)
+    """
+    out = np.empty(values.size)
+    here = start
+    for i in range(values.size):
+        here = max(values[i] - width, min(values[i] + width, here))
+        out[i] = here
+    return out, here
