@@ -56,7 +56,10 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
         stored.close()
         raise FormatError(f"{path}: is {name}, but not one that gyrostab wrote; read it with gyrostab.read_log (gyrostab ingest)")
     is_log = stored.attrs.get("gyrostab_content") == "log"
-    return _lazy(_lazy_log(stored, path, strict=strict) if is_log else stored, small=_SMALL if is_log else 0)
+    opened = _lazy(_lazy_log(stored, path, strict=strict) if is_log else stored, small=_SMALL if is_log else 0)
+    if is_log:
+        stored.close()  # opened again where needed; while a NetCDF file is open, its library keeps the chunks read through any other handle
+    return opened
 
 
 def _lazy(stored: xr.Dataset, *, small: int) -> xr.Dataset:
