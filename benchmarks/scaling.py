@@ -1,10 +1,11 @@
 """How the time of a run grows with the length of the log, the number of averaging times, and the window over the step; and its memory.
 
-    python benchmarks/scaling.py [--hours 1 2 4 8 16] [--workers 2] [--rounds 3] [--output scaling.md]
+    python benchmarks/scaling.py [--hours 1 2 4 8 16] [--workers 2] [--rounds 3] [--output docs/scaling.md]
 
 Each run is the whole `gyrostab run` (read, DAVAR, fit, write) in a process of its own, from a Zarr store of integer counts of three
 axes at 400 Hz, so that its peak memory is its own. The time of the best of several rounds counts; what a run of the
-shortest log needs to start (imports, compiled kernels) is measured too and left out of the exponent. The tables are Markdown.
+shortest log needs to start (imports, compiled kernels) is measured too and left out of the exponent. The tables are Markdown; `--output docs/scaling.md` puts them in
+their place there.
 """
 
 from __future__ import annotations
@@ -159,7 +160,9 @@ def main() -> None:
     text = "\n\n".join(parts)
     print(text)
     if given.output:
-        given.output.write_text(text + "\n")
+        begin, end = "<!-- scaling: begin -->", "<!-- scaling: end -->"
+        page = given.output.read_text() if given.output.exists() else f"{begin}\n{end}\n"
+        given.output.write_text(f"{page.split(begin)[0]}{begin}\n{text}\n{end}{page.split(end)[1]}")
 
 
 if __name__ == "__main__":
