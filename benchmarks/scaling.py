@@ -3,9 +3,9 @@
     python benchmarks/scaling.py [--hours 1 2 4 8 16] [--workers 2] [--rounds 3] [--output docs/scaling.md]
 
 Each run is the whole `gyrostab run` (read, DAVAR, fit, write) in a process of its own, from a Zarr store of integer counts of three
-axes at 400 Hz, so that its peak memory is its own. The time of the best of several rounds counts; what a run of the
-shortest log needs to start (imports, compiled kernels) is measured too and left out of the exponent. The tables are Markdown; `--output docs/scaling.md` puts them in
-their place there.
+axes at 400 Hz, so that its peak memory is its own. The best of several rounds counts; what a run of a very short log takes (imports,
+compiled kernels) is measured too and left out of the second exponent. The tables are Markdown; `--output docs/scaling.md` puts
+them in their place there.
 """
 
 from __future__ import annotations
