@@ -1,0 +1,331 @@
+"""Bias that changes in steps: jumps, telegraph, hops by whole fringes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from gyrostab.errors import OptionError
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.physics.lorentz import lorentz_density
+
+__all__ = ["BiasJump", "FringeHop", "Telegraph", "step_means"]
+
+_HOUR = 3600.0
+_LIGHT = 299_792_458.0  # m/s
+_RADIAN_PER_S = math.degrees(1.0) * _HOUR  # deg/h
+
+
+def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, size: int) -> Array:
+    """Mean over each sample of something that is constant but for steps.
+
+    Parameters
+    ----------
+    positions : sequence of float
+        Where it steps, rising [samples since the start of the log].
+    levels : sequence
+        Values before the first step, after it, and so on: one more than steps. A value may be an array, of rows.
+    first, size : int
+        The samples asked for.
+
+    Returns
+    -------
+    ndarray, shape (size,) or (rows, size)
+
+    Examples
+    --------
+    >>> step_means([1.0, 2.75], [0.0, 4.0, -4.0], 0, 4)
+    array([ 0.,  4.,  2., -4.])
+    """
+    where, values = np.asarray(positions, np.float64), np.asarray(levels, np.float64)
+    steps = np.diff(values, axis=0)
+    means = values[np.searchsorted(where, first + np.arange(size), side="right")]
+    index = np.floor(where).astype(np.int64) - first
+    inside = (index >= 0) & (index < size) & (where > np.floor(where))
+    left = (index + first + 1 - where)[inside]
+    np.add.at(means, index[inside], steps[inside] * left.reshape(-1, *(1,) * (values.ndim - 1)))
+    return np.ascontiguousarray(means.T)
+
+
+@dataclass
+class _Stepping:
+    """Where a process that steps at random stands, and when it steps next [samples]."""
+
+    rng: np.random.Generator
+    level: Any
+    next: float
+
+
+def _go(process: _Stepping, end: float, step: Callable[[_Stepping], None]) -> tuple[list[float], list[Any]]:
+    """Steps before the sample `end`; `step` changes the level and sets when it steps next."""
+    positions: list[float] = []
+    levels = [process.level]
+    while process.next < end:
+        positions.append(process.next)
+        step(process)
+        levels.append(process.level)
+    return positions, levels
+
+
+def _wait(rng: np.random.Generator, mean: float) -> float:
+    """A random time without memory, endless where its mean is."""
+    drawn = float(rng.standard_exponential())
+    return math.inf if math.isinf(mean) else drawn * mean
+
+
+def _share_after(windows: Windows, instant: float) -> Array:
+    """Share of every window that lies after an instant [s]."""
+    return np.clip((windows.end - instant) / (windows.end - windows.begin), 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BiasJump(Effect):
+    """Bias that jumps, at restarts, at shocks, or at a time that is given, and stays.
+
+    ``b = J_1 + J_2 + ...``, with normal J of the rms `restart` each time power comes back, and of the rms `shock` at random times;
+    and the step `step` at the time `at`. A shock concerns all axes, with sizes of their own.
+
+    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` in the windows W across a jump D, if it lies in their middle third: an apparent
+    ``K = D / sqrt(W)``, gone in windows wholly before or after. *Window mean*: steps and stays. *Spectrum*: nothing between the
+    jumps. *Axes*: at the same times, with sizes and signs that have nothing to do with each other.
+
+    Confused with vibration_rectification (goes back when vibration ends), warm_up (decays), telegraph (comes back to the same level)
+    and K (grows within windows as well): the jump coincides with a restart or a shock and does not go back.
+
+    References
+    ----------
+    Wang et al. 2016, Sensors (loss of power and vibration in one record). Sizes are estimates: 0.01 to 0.1 deg/h for a good gyro, 0.1 to
+    3 deg/h for a simple one.
+
+    Examples
+    --------
+    >>> BiasJump(step=0.1, at=330, axes=["x"]).say()
+    'The bias jumps on axis x: by 0.1 deg/h at 330 s.'
+    """
+
+    name: ClassVar[str] = "bias_jump"
+    short: ClassVar[str] = "bias changes at restarts, shocks"
+    stage: ClassVar[Stage] = "rate"
+    size_parameters: ClassVar[tuple[str, ...]] = ("restart", "shock", "step")
+    references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)
+
+    restart: float = parameter("deg/h", "rms of the jump at every restart", default=0.0, typical=0.05, low=0.0, high=1e6)
+    shock: float = parameter("deg/h", "rms of the jump at every shock", default=0.0, typical=0.02, low=0.0, high=1e6)
+    shocks_per_hour: float = parameter("1/h", "shocks at random times", default=0.0, typical=2.0, low=0.0, high=1e6)
+    step: tuple[float, ...] = parameter("deg/h", "jump at the time `at`", default=(), typical=(0.1,), low=-1e9, high=1e9, many=True)
+    at: float = parameter("s", "time of that jump since the start of the log", default=0.0, typical=100.0, low=0.0)
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """Jumps at restarts and at the time given, which are known; and the first shock."""
+        restarts, shocks = rng.spawn(2)
+        count = len(setup.axes)
+        normal = restarts.standard_normal((len(setup.restarts), count))
+        places = np.append(setup.restarts[:, 1].astype(np.float64), self.at * setup.rate)
+        jumps = np.concatenate([self.restart * normal, self.each("step", setup.axes)[None]])
+        order = np.argsort(places, kind="stable")
+        levels = np.cumsum(np.concatenate([np.zeros((1, count)), jumps[order]]), axis=0)
+        mean = _HOUR * setup.rate / self.shocks_per_hour if self.shocks_per_hour else math.inf
+        return places[order], levels, _Stepping(shocks, np.zeros(count), _wait(shocks, mean)), mean
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+        places, levels, process, mean = state
+
+        def jump(process: _Stepping) -> None:
+            process.level = process.level + self.shock * process.rng.standard_normal(len(chunk.setup.axes))
+            process.next += _wait(process.rng, mean)
+
+        known = step_means(places, levels, chunk.first, chunk.size)
+        return known + step_means(*_go(process, chunk.first + chunk.size, jump), chunk.first, chunk.size), state
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """Times of the jump: where power came back, and the edges of the windows."""
+        known = windows.restarts[:, 1] if windows.restarts.size else np.empty(0)
+        return {"at": np.unique(np.concatenate([known, windows.begin[1:]]))}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means: the share of every window after the jump. The sizes of random jumps are found as `step`, one after the other."""
+        return Prediction(mean={"step": _share_after(windows, self.at)})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        parts = [f"by {self.quantity('step', errors)} at {self.at:.6g} s"] if any(self.step) else []
+        parts += [f"by {self.quantity('restart', errors)} rms at restarts"] if self.restart else []
+        if self.shock:
+            parts.append(f"by {self.quantity('shock', errors)} rms at shocks, {self.shocks_per_hour:.3g} in an hour")
+        return f"The bias jumps {self.on_axes()}: {'; '.join(parts) or 'by nothing'}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Telegraph(Effect):
+    """Bias that switches between two levels at random times.
+
+    ``b = 0`` or ``D``; the times between switches have no memory, with the means `low` (at 0) and `high` (at D).
+
+    *DAVAR*: that of a Gauss-Markov process with the variance ``D^2 p (1 - p)``, p = high / (low + high), and the correlation time T_c of
+    ``1 / T_c = 1 / low + 1 / high``: a bump at 1.89 T_c; +1/2 before, -1/2 after it. *Window mean*: two levels, smeared
+    where windows are longer than T_c. *Spectrum*: Lorentzian. *Axes*: independent.
+
+    Confused with gauss_markov, which second-order statistics cannot tell from it: the histogram of short means has two peaks (negative
+    excess kurtosis), and it takes some ten switches to see it. bias_jump does not come back to the same level.
+
+    References
+    ----------
+    Machlup 1954, J. Appl. Phys. 25, 341 (spectrum). Sizes are estimates: 0.01 to 0.3 deg/h, 10 to 1000 s.
+
+    Examples
+    --------
+    >>> Telegraph(step=0.1, low=100, high=50, axes=["x"]).say()
+    'The bias switches by 0.1 deg/h on axis x, for 50 s up and 100 s down on average.'
+    """
+
+    name: ClassVar[str] = "telegraph"
+    short: ClassVar[str] = "bias switches between levels"
+    stage: ClassVar[Stage] = "rate"
+    size_parameters: ClassVar[tuple[str, ...]] = ("step",)
+    references: ClassVar[tuple[str, ...]] = ("Machlup 1954, J. Appl. Phys.",)
+
+    step: tuple[float, ...] = parameter("deg/h", "upper level over the lower", typical=(0.1,), low=-1e9, high=1e9, many=True)
+    low: float = parameter("s", "mean time at the lower level, where the bias is 0", default=100.0, low=1e-3, high=1e9)
+    high: float = parameter("s", "mean time at the upper level", default=100.0, low=1e-3, high=1e9)
+
+    @property
+    def correlation_time(self) -> float:
+        """T_c [s]."""
+        return self.low * self.high / (self.low + self.high)
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """Every axis on one of its levels, as if it had begun long ago."""
+        rows = []
+        for child in rng.spawn(len(setup.axes)):
+            up = float(child.random() < self.high / (self.low + self.high))
+            rows.append(_Stepping(child, up, _wait(child, (self.high if up else self.low) * setup.rate)))
+        return rows
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """Rate contribution [degree hour-1] on every sample."""
+
+        def switch(process: _Stepping) -> None:
+            process.level = 1.0 - process.level
+            process.next += _wait(process.rng, (self.high if process.level else self.low) * chunk.rate)
+
+        end = chunk.first + chunk.size
+        unit = np.stack([step_means(*_go(row, end, switch), chunk.first, chunk.size) for row in state])
+        return self.each("step", chunk.setup.axes)[:, None] * unit, state
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """Mean times at both levels, from a sample to the whole record."""
+        times = np.geomspace(10.0 / windows.rate, max(windows.end[-1] / 4.0, 20.0 / windows.rate), 6)
+        return {"low": times, "high": times}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """The spectrum of the samples."""
+        share = self.high / (self.low + self.high)
+        density = share * (1.0 - share) * lorentz_density(windows.frequency, self.correlation_time, windows.rate)
+        return Prediction(spectrum={"step": np.broadcast_to(density, (windows.begin.size, density.size))})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        times = f"for {self.quantity('high', errors)} up and {self.quantity('low', errors)} down on average"
+        return f"The bias switches by {self.quantity('step', errors)} {self.on_axes()}, {times}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class FringeHop(Effect):
+    """The loop locks on another fringe: the rate steps by a whole number of fringes.
+
+    ``w_out = w + k lambda c / (L D)``, L the length and D the diameter of the coil; the index of the glass does not matter. A hop
+    by k = ``order`` comes at the time `at`, or else at random times by plus or minus k, stays for a time of mean `hold`, and
+    ends at a restart.
+
+    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` with the huge D of a fringe: nothing else is seen in windows across. *Window mean*: steps
+    of one size, both signs. *Spectrum*: that of a few steps. *Axes*: independent, the size of each from its own coil.
+
+    Confused with bias_jump (any size), clipping (ends at the range) and bit errors (single samples, powers of two): the size of the
+    step is that of the coil, always.
+
+    References
+    ----------
+    Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (unambiguous range): 500 m on 4 cm at 1550 nm make 1331 deg/s. How often is an
+    estimate.
+
+    Examples
+    --------
+    >>> hop = FringeHop(order=1, length=500, diameter=0.04, at=60, axes=["z"])
+    >>> round(hop.fringe / 3600)
+    1331
+    >>> hop.say()
+    'The gyro hops by 1 fringe of 4.792e+06 deg/h on axis z, at 60 s.'
+    """
+
+    name: ClassVar[str] = "fringe_hop"
+    short: ClassVar[str] = "steps of one fringe"
+    stage: ClassVar[Stage] = "electronics"
+    size_parameters: ClassVar[tuple[str, ...]] = ("order",)
+    references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)
+
+    order: float = parameter("1", "fringes of a hop, with its sign", default=1.0, low=-1000.0, high=1000.0)
+    length: float = parameter("m", "length of the coil's fibre", default=500.0, low=1.0, high=1e5, source="Lefevre 2014")
+    diameter: float = parameter("m", "diameter of the coil", default=0.04, low=1e-3, high=10.0, source="Lefevre 2014")
+    wavelength: float = parameter("nm", "wavelength of the light", default=1550.0, low=100.0, high=1e4, source="Lefevre 2014")
+    at: float = parameter("s", "time of the hop; inf for random ones", default=math.inf, low=0.0)
+    per_hour: float = parameter("1/h", "random hops, while on the right fringe", default=0.0, typical=60.0, low=0.0, high=1e6)
+    hold: float = parameter("s", "mean time until it hops back; inf for never", default=math.inf, typical=20.0, low=1e-6)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.order != int(self.order):
+            raise OptionError(f"effect {self.name!r}, parameter 'order': {self.order:g} is not a whole number of fringes; give one")
+
+    @property
+    def fringe(self) -> float:
+        """Rate of one fringe [degree hour-1]."""
+        return self.wavelength * 1e-9 * _LIGHT / (self.length * self.diameter) * _RADIAN_PER_S
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """On the right fringe."""
+        mean = _HOUR * setup.rate / self.per_hour if self.per_hour else math.inf
+        children = rng.spawn(len(setup.axes))
+        if math.isfinite(self.at):
+            return [_Stepping(child, 0.0, self.at * setup.rate) for child in children]
+        return [_Stepping(child, 0.0, _wait(child, mean)) for child in children]
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """The signal with the hops [degree hour-1]."""
+        mean = _HOUR * chunk.rate / self.per_hour if self.per_hour and math.isinf(self.at) else math.inf
+        losses = chunk.setup.restarts[:, 0].astype(np.float64)
+
+        def hop(process: _Stepping) -> None:
+            if process.level:
+                process.level = 0.0
+                process.next += _wait(process.rng, mean)
+                return
+            sign = 1.0 if math.isfinite(self.at) or process.rng.random() < 0.5 else -1.0
+            process.level = sign
+            later = losses[losses > process.next]
+            process.next = min(process.next + _wait(process.rng, self.hold * chunk.rate), float(later[0]) if later.size else math.inf)
+
+        end = chunk.first + chunk.size
+        fringes = np.stack([step_means(*_go(row, end, hop), chunk.first, chunk.size) for row in state])
+        return chunk.signal + self.order * self.fringe * fringes, state
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """The time of the hop: the edges of the windows."""
+        return {"at": windows.begin[1:]}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means: one fringe after the hop, until it hops back on average."""
+        if math.isinf(self.at):
+            return Prediction(mean={"order": np.zeros(windows.begin.size)})
+        share = _share_after(windows, self.at) - _share_after(windows, self.at + self.hold)
+        return Prediction(mean={"order": self.fringe * share})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        count = self.quantity("order", errors)
+        when = f"at {self.at:.6g} s" if math.isfinite(self.at) else f"{self.per_hour:.3g} times in an hour"
+        return f"The gyro hops by {count} fringe{'' if self.order == 1 else 's'} of {self.fringe:.4g} deg/h {self.on_axes()}, {when}."

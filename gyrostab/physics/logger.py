@@ -1,0 +1,348 @@
+"""What the logger and the telemetry do to the samples: filters, the lattice of values, errors of bits, samples held."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from gyrostab.errors import OptionError
+from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+
+__all__ = ["HeldSamples", "LoggerFilter", "RateQuantization", "Spikes"]
+
+_HOUR = 3600.0
+
+
+def _whole(effect: Effect, name: str) -> int:
+    """A parameter that must be a whole number."""
+    value = float(getattr(effect, name))
+    if value != int(value):
+        raise OptionError(f"effect {effect.name!r}, parameter {name!r}: {value:g} is not a whole number; give one")
+    return int(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoggerFilter(Effect):
+    """The logger's filter, at the rate of the instrument, and how it makes the samples of the log.
+
+    Low-pass: Butterworth of `order` poles with half power at `cutoff`, made digital by the bilinear transform. Then a moving average
+    over `length`. Then the samples of the log: the mean of those of the instrument (integrate and dump), or with ``pick = 1`` every
+    n-th of them, n the `oversampling` of the model, so that what the filter lets through above half of the log's rate folds down. All
+    are causal and remember from chunk to chunk.
+
+    *DAVAR*: less at times below ``1 / cutoff`` or `length`, slope -1 of the variance further up unchanged: a deficit at the left end,
+    down to sigma ~ tau^0. Picked without a filter: more white noise at all times, n times the variance. *Window mean*: nothing.
+    *Spectrum*: multiplied by ``sum_k |H(f + k fs)|^2``. *Axes*: all alike.
+
+    Confused with a smaller N (look at long times), negative Q, held_samples, and a wrong sampling rate (lines move): the spectrum
+    up to 0.3 fs decides.
+
+    References
+    ----------
+    Oppenheim and Schafer 2010, Discrete-Time Signal Processing, 3rd ed. (bilinear transform, decimation). Sizes are estimates: 0.2 to 0.4
+    times the log's rate.
+
+    Examples
+    --------
+    >>> LoggerFilter(cutoff=80, order=4).say()
+    'The logger filters on all axes: low-pass of order 4 at 80 Hz; its samples are means.'
+    """
+
+    name: ClassVar[str] = "logger_filter"
+    short: ClassVar[str] = "low-pass, integrate-and-dump, decimation"
+    stage: ClassVar[Stage] = "sampling"
+    size_parameters: ClassVar[tuple[str, ...]] = ("cutoff", "length", "pick")
+    references: ClassVar[tuple[str, ...]] = ("Oppenheim and Schafer 2010, Discrete-Time Signal Processing",)
+
+    cutoff: float = parameter("Hz", "half power of the low-pass; 0 for none", default=0.0, typical=2.0, low=0.0, high=1e6)
+    order: float = parameter("1", "poles of the low-pass", default=2.0, low=1.0, high=12.0)
+    length: float = parameter("s", "length of the moving average; 0 for none", default=0.0, low=0.0, high=1e4)
+    pick: float = parameter("1", "1: every n-th sample of the instrument; 0: means of n", default=0.0, low=0.0, high=1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _whole(self, "order")
+        _whole(self, "pick")
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """The sections of the low-pass and the length of the average; no samples yet."""
+        sections = None
+        if self.cutoff:
+            from scipy.signal import butter
+
+            if self.cutoff >= setup.rate / 2.0:
+                raise OptionError(
+                    f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of the instrument's {setup.rate:g} Hz; "
+                    "raise oversampling in the model's [log], or lower the cutoff"
+                )
+            sections = butter(int(self.order), self.cutoff, fs=setup.rate, output="sos")
+        taps = max(1, round(self.length * setup.rate))
+        if taps > 10_000:
+            raise OptionError(
+                f"effect {self.name!r}: a length of {self.length:g} s is {taps} samples of the instrument; give at most 10000"
+            )
+        return sections, None, taps, None
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """The signal after the filter [degree hour-1]."""
+        sections, inner, taps, memory = state
+        signal = chunk.signal
+        if sections is not None:
+            from scipy.signal import sosfilt, sosfilt_zi
+
+            if inner is None:
+                inner = sosfilt_zi(sections)[:, None, :] * signal[None, :, :1]
+            signal, inner = sosfilt(sections, signal, zi=inner)
+        if taps > 1:
+            memory = np.repeat(signal[:, :1], taps - 1, axis=1) if memory is None else memory
+            known = np.concatenate([memory, signal], axis=1)
+            memory = known[:, known.shape[1] - (taps - 1) :]
+            total = np.zeros_like(signal)
+            for lag in range(taps):
+                total += known[:, lag : lag + chunk.size]
+            signal = total / taps
+        if self.pick:
+            signal = signal[:, :: chunk.setup.oversampling]
+        return signal, (sections, inner, taps, memory)
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """Cutoffs and lengths about the log's rate."""
+        return {"cutoff": windows.rate * np.array([0.0, 0.1, 0.2, 0.4]), "length": np.array([0.0, 1.0, 2.0, 4.0]) / windows.rate}
+
+    def explain(self, windows: Windows) -> Prediction:
+        """By what the spectrum of white noise is multiplied, for an instrument much faster than the log."""
+        from gyrostab.kernels.coloured import folded_psd
+
+        if not (self.cutoff or self.length):
+            return Prediction()
+        highest = min(20.0 * self.cutoff if self.cutoff else math.inf, 50.0 / self.length if self.length else math.inf)
+
+        def gain(f: Array) -> Array:
+            low = 1.0 / (1.0 + (f / self.cutoff) ** (2 * int(self.order))) if self.cutoff else 1.0
+            return np.asarray(low * np.sinc(f * self.length) ** 2)
+
+        return Prediction(response=folded_psd(gain, windows.frequency, windows.rate, max(highest, windows.rate), average=not self.pick))
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        parts = [f"low-pass of order {int(self.order)} at {self.quantity('cutoff', errors)}"] if self.cutoff else []
+        parts += [f"average over {self.quantity('length', errors)}"] if self.length else []
+        taken = "picked" if self.pick else "means"
+        return f"The logger filters {self.on_axes()}: {', '.join(parts) or 'nothing'}; its samples are {taken}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateQuantization(Effect):
+    """The rate is rounded to a lattice of values.
+
+    ``out = q round(w / q)``, or with ``mode = "floor"`` the value below.
+
+    *DAVAR*: ``q^2 / (12 k)`` more at k samples, white like N, where the noise of a sample is above q / 2; where it is smaller, steps
+    and dead bands: nothing at all, or too much. *Window mean*: -q / 2 for "floor". *Spectrum*: flat. *Axes*: independent.
+
+    Confused with N (the same, but for the lattice) and Q, the rounding of an angle that is carried on, with slope -1: look at the
+    differences of values, which are multiples of q.
+
+    References
+    ----------
+    Widrow and Kollar 2008, Quantization Noise (q^2 / 12). Sizes: 0.1 arcsec in 10 ms is 36 000 nrad/s or 10 deg/h in a common file format.
+
+    Examples
+    --------
+    >>> RateQuantization(step=0.5).say()
+    'The rate stands on a lattice of 0.5 deg/h on all axes.'
+    """
+
+    name: ClassVar[str] = "rate_quantization"
+    short: ClassVar[str] = "value lattice of the rate"
+    stage: ClassVar[Stage] = "logger"
+    size_parameters: ClassVar[tuple[str, ...]] = ("step",)
+    references: ClassVar[tuple[str, ...]] = ("Widrow and Kollar 2008, Quantization Noise",)
+
+    step: float = parameter("deg/h", "distance between the values", typical=1.0, low=0.0, high=1e9)
+    mode: str = parameter("text", "to the nearest value, or the one below", default="round", choices=("round", "floor"))
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """The signal on the lattice [degree hour-1]."""
+        if self.step == 0.0:
+            return chunk.signal, state
+        count = chunk.signal / self.step
+        return self.step * (np.rint(count) if self.mode == "round" else np.floor(count)), state
+
+    def explain(self, windows: Windows) -> Prediction:
+        """White noise of step^2 / 12 in every sample; half a step less on average where the value below is taken."""
+        white = np.full((windows.begin.size, windows.frequency.size), 1.0 / (12.0 * windows.rate))
+        mean = {"step": np.full(windows.begin.size, -0.5)} if self.mode == "floor" else {}
+        return Prediction(mean=mean, spectrum={"step": white})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        return f"The rate stands on a lattice of {self.quantity('step', errors)} {self.on_axes()}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spikes(Effect):
+    """Single samples that are wrong: a bit of the number, or an outlier.
+
+    At random times, each axis by itself: ``kind = "bit"`` turns one bit, any of `bits` with equal chance, of the count of `lsb`
+    (two's complement); ``"outlier"`` adds a normal number of the rms `size`.
+
+    *DAVAR*: white, ``p E[d^2] / k`` more at k samples, p the chance of a sample and d the spike, which the largest bits rule; windows
+    with a spike stand out from those without. *Window mean*: moved by d / n. *Spectrum*: flat. *Axes*: independent.
+
+    Confused with Q, N and real shocks (last longer than a sample, seen by accelerometers): kurtosis; the sizes of bit errors
+    are powers of two times the lattice.
+
+    References
+    ----------
+    IEEE Std 952-1997 (test of the data for outliers). Rates are estimates.
+
+    Examples
+    --------
+    >>> Spikes(per_hour=2, lsb=0.1, bits=16).say()
+    'Now and then a sample is wrong on all axes: one of 16 bits of 0.1 deg/h, 2 times in an hour.'
+    """
+
+    name: ClassVar[str] = "spikes"
+    short: ClassVar[str] = "bit errors, outliers"
+    stage: ClassVar[Stage] = "logger"
+    size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
+    references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
+
+    per_hour: float = parameter("1/h", "wrong samples of every axis", typical=60.0, low=0.0, high=1e8)
+    kind: str = parameter("text", "what is wrong", default="bit", choices=("bit", "outlier"))
+    lsb: float = parameter("deg/h", "what the lowest bit counts", default=0.1, low=1e-12, high=1e9)
+    bits: float = parameter("1", "bits of the number", default=16.0, low=2.0, high=48.0)
+    size: float = parameter("deg/h", "rms of an outlier", default=100.0, low=0.0, high=1e12)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _whole(self, "bits")
+
+    def _chance(self, rate: float) -> float:
+        """That a sample is wrong."""
+        return min(1.0, self.per_hour / _HOUR / rate)
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """The first wrong sample of every axis."""
+        chance = self._chance(setup.rate)
+        return [(child, int(child.geometric(chance)) - 1 if chance else None) for child in rng.spawn(len(setup.axes))]
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """The signal with the wrong samples [degree hour-1]."""
+        signal, chance, after = chunk.signal.copy(), self._chance(chunk.rate), []
+        for row, (child, following) in enumerate(state):
+            while following is not None and following < chunk.first + chunk.size:
+                place = following - chunk.first
+                signal[row, place] = self._wrong(float(signal[row, place]), child)
+                following += int(child.geometric(chance))
+            after.append((child, following))
+        return signal, after
+
+    def _wrong(self, value: float, rng: np.random.Generator) -> float:
+        if self.kind == "outlier":
+            return value + self.size * float(rng.standard_normal())
+        bits = int(self.bits)
+        bit = int(rng.integers(bits))
+        is_set = (round(value / self.lsb) >> bit) & 1
+        weight = -(1 << bit) if bit == bits - 1 else 1 << bit
+        return value + (-weight if is_set else weight) * self.lsb
+
+    def explain(self, windows: Windows) -> Prediction:
+        """White noise of the mean square of the spikes, which hides that they are few."""
+        bits = int(self.bits)
+        name, square = ("size", 1.0) if self.kind == "outlier" else ("lsb", (4.0**bits - 1.0) / (3.0 * bits))
+        white = np.full((windows.begin.size, windows.frequency.size), self._chance(windows.rate) * square / windows.rate)
+        return Prediction(spectrum={name: white})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        bit = f"one of {int(self.bits)} bits of {self.quantity('lsb', errors)}"
+        what = bit if self.kind == "bit" else f"by {self.quantity('size', errors)} rms"
+        often = self.quantity("per_hour", errors).removesuffix(" 1/h")
+        return f"Now and then a sample is wrong {self.on_axes()}: {what}, {often} times in an hour."
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldSamples(Effect):
+    """Samples that were lost and filled: with the last good one, or with zero, without a word.
+
+    From random times on, all axes together, as many samples as `length` says on average (at least one; without memory) are filled.
+
+    *DAVAR*: ``repeat``: less at one sample, by the share of held ones; more at long times, where one sample counts for many: N^2 grows
+    by ``1 + 2 p m^2`` for m samples with the chance p. ``zero``: ``2 share w^2 / k``-like noise of the mean rate w. *Window mean*:
+    pulled to zero by "zero". *Spectrum*: less at the top, more below. *Axes*: the same samples.
+
+    Confused with logger_filter and small noise (no runs), clipping (runs at the limit only), real gaps: runs of equal values, which noise
+    does not make.
+
+    References
+    ----------
+    Wang et al. 2016, Sensors (loss of data on the way up, zeros in its place). Rates are estimates.
+
+    Examples
+    --------
+    >>> HeldSamples(per_hour=30, length=0.5).say()
+    'Samples are lost and filled with the last one on all axes, 30 times in an hour for 0.5 s on average.'
+    """
+
+    name: ClassVar[str] = "held_samples"
+    short: ClassVar[str] = "repeated or zero-filled samples"
+    stage: ClassVar[Stage] = "logger"
+    size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
+    references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)
+
+    per_hour: float = parameter("1/h", "losses, while there is none", typical=360.0, low=0.0, high=1e8)
+    length: float = parameter("s", "mean length of one; at least a sample", default=0.5, low=0.0, high=1e6)
+    fill: str = parameter("text", "what stands there", default="repeat", choices=("repeat", "zero"))
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """The first loss, [first sample, one past the last], and the last good sample of every axis."""
+        return rng, self._next(rng, 0, setup.rate), None
+
+    def _next(self, rng: np.random.Generator, after: int, rate: float) -> tuple[int, int] | None:
+        """The next loss, with at least one good sample before it."""
+        if self.per_hour == 0.0:
+            return None
+        first = after + int(rng.geometric(min(1.0, self.per_hour / _HOUR / rate)))
+        return first, first + int(rng.geometric(1.0 / max(1.0, self.length * rate)))
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+        """The signal with the losses filled [degree hour-1]."""
+        rng, loss, last = state
+        end = chunk.first + chunk.size
+        source = np.arange(chunk.size)
+        held = np.zeros(chunk.size, bool)
+        while loss is not None and loss[0] < end:
+            low, high = max(loss[0], chunk.first) - chunk.first, min(loss[1], end) - chunk.first
+            held[low:high] = True
+            source[low:high] = low - 1
+            if loss[1] > end:
+                break
+            loss = self._next(rng, loss[1], chunk.rate)
+        if self.fill == "zero":
+            return np.where(held, 0.0, chunk.signal), (rng, loss, None)
+        before = chunk.signal[:, :1] if last is None else last
+        known = np.concatenate([before, chunk.signal], axis=1)
+        signal = known[:, source + 1]
+        return signal, (rng, loss, signal[:, -1:].copy())
+
+    def explain(self, windows: Windows) -> Prediction:
+        """More N at long times; or the window means pulled to zero."""
+        count = max(1.0, self.length * windows.rate)
+        if self.fill == "zero":
+            share = count / windows.rate / _HOUR
+            own = np.stack([windows.own[axis] for axis in windows.axes])
+            return Prediction(mean={"per_hour": -share * own})
+        growth = 2.0 * count**2 / (_HOUR * windows.rate)
+        return Prediction(level={("N", "per_hour"): np.full(windows.begin.size, growth)})
+
+    def say(self, errors: Mapping[str, float] | None = None) -> str:
+        """Say it in one sentence."""
+        what = "the last one" if self.fill == "repeat" else "zero"
+        often, length = self.quantity("per_hour", errors).removesuffix(" 1/h"), self.quantity("length", errors)
+        return f"Samples are lost and filled with {what} {self.on_axes()}, {often} times in an hour for {length} on average."
