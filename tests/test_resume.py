@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab import checkpoint, davar, engine, fit_noise, make_log, open_product, to_netcdf
+from gyrostab import davar, fit_noise, make_log, open_product, to_netcdf
 from gyrostab.cli import main
 from gyrostab.davar import davar_part, davar_parts
 from gyrostab.export import open_log
-from gyrostab.job import folder_of, hold
+from gyrostab.run import checkpoint, engine
+from gyrostab.run.job import folder_of, hold
 from tests.crashing import WINDOW
 
 pytestmark = pytest.mark.xdist_group("resume")
@@ -92,7 +93,7 @@ def computed(monkeypatch) -> list[slice]:
         parts.append(part)
         return engine.compute_part(log, part, windows, fitting)
 
-    monkeypatch.setattr("gyrostab.run.compute_part", counted)
+    monkeypatch.setattr("gyrostab.run.core.compute_part", counted)
     return parts
 
 
@@ -255,14 +256,14 @@ def test_changes_refuse_to_resume_and_say_what(log, tmp_path, after_two, monkeyp
     own.write_bytes(log.read_bytes())
     os.utime(own, ns=(stamp, stamp))
     with monkeypatch.context() as patch:
-        patch.setattr("gyrostab.job._version", lambda name: "9.9.9")
+        patch.setattr("gyrostab.run.job._version", lambda name: "9.9.9")
         refused(expected="gyrostab is 9.9.9, was ")
     assert call(own, "-o", output, "--resume") == 0
 
 
 def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
     from gyrostab import to_zarr
-    from gyrostab.job import differences, make_fingerprint
+    from gyrostab.run.job import differences, make_fingerprint
 
     store = to_zarr(open_log(log), tmp_path / "run7.zarr")
     before = make_fingerprint([store], {})

@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
-from gyrostab.checkpoint import find_blocks
-from gyrostab.checks import check_output, check_windows
-from gyrostab.engine import Blocks, compute_blocks, compute_part, share_constant, write_blocks
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
-from gyrostab.job import (
+from gyrostab.progress import Stage, no_stage
+from gyrostab.run.checkpoint import find_blocks
+from gyrostab.run.checks import check_output, check_windows
+from gyrostab.run.engine import Blocks, compute_blocks, compute_part, share_constant, write_blocks
+from gyrostab.run.job import (
     begin_job,
     clear_job,
     describe_inputs,
@@ -31,10 +32,9 @@ from gyrostab.job import (
     remove_job,
     remove_leftovers,
 )
-from gyrostab.progress import Stage, no_stage
-from gyrostab.schedule import Pool, check_scheduler, open_pool
+from gyrostab.run.schedule import Pool, check_scheduler, open_pool
 
-__all__ = ["check_output", "check_windows", "load_log", "run", "samples_of"]
+__all__ = ["load_log", "run", "samples_of"]
 
 
 def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: Any) -> xr.Dataset:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.checkpoint import Block, assemble, write_block
 from gyrostab.davar import davar_part
 from gyrostab.export import to_netcdf
 from gyrostab.fit import fit_noise
 from gyrostab.progress import Stage
-from gyrostab.schedule import Pool, in_any_order
+from gyrostab.run.checkpoint import Block, assemble, write_block
+from gyrostab.run.schedule import Pool, in_any_order
 
 __all__ = ["Blocks", "compute_blocks", "compute_part", "share_constant", "write_blocks"]
 
