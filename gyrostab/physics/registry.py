@@ -70,7 +70,7 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     name = table.get("name")
     if name is None:
         raise OptionError(f"{where}: an effect has no name; write name = ... with one of {', '.join(effects())}")
-    if name not in effects():
+    if not isinstance(name, str) or name not in effects():
         raise OptionError(f"{where}: there is no effect {name!r}{close_to(name, list(effects()))}; there are {', '.join(effects())}")
     kind = effects()[name]
     known = {item.name: item for item in kind.parameters()}
@@ -81,6 +81,10 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
             raise OptionError(
                 f"{where}: effect {name!r} has no parameter {key!r}{close_to(key, list(known))}; it has {listed}, and axes and driver"
             )
+    for key in ("axes", "driver"):
+        given = values.get(key, [])
+        if not isinstance(given, str) and not (isinstance(given, list | tuple) and all(isinstance(one, str) for one in given)):
+            raise OptionError(f"{where}: effect {name!r}: {key} = {given!r} is not a list of names")
     for key in kind.required():
         if key not in values:
             item = known[key]

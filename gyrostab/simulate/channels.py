@@ -110,8 +110,8 @@ def channel(
     >>> channel("supply_voltage", "V", lambda t: 28.0 - t / 3600, duration="1h").supply_voltage.sizes
     Frozen({'time_supply_voltage': 3600})
     """
-    if not (math.isfinite(sensor_rate) and sensor_rate > 0):
-        raise OptionError(f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number above 0, in Hz")
+    if not 0 < sensor_rate <= 1e5:
+        raise OptionError(f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number of Hz above 0 and up to 1e5")
     size = max(1, math.ceil(duration_seconds(duration, "duration") * sensor_rate - 1e-6))
     dim = f"time_{name}"
     attrs = {"units": unit, "long_name": name.replace("_", " "), **(attributes or {})}

@@ -143,6 +143,8 @@ def _frame(model: Model, *, duration: Any, rate: float | None, start: Any, seed:
             raise OptionError(f"{model.source}: there is no {name}; give {name} = {example} in [log], --{name}, or --like RECORDING")
     if isinstance(hertz, bool) or not isinstance(hertz, int | float) or not (math.isfinite(hertz) and 0 < hertz <= 1e6):
         raise OptionError(f"{model.source}: rate {hertz!r} is not a number of Hz above 0 and up to 1e6")
+    if isinstance(length, bool) or duration_seconds(length, "duration") > 1e9:
+        raise OptionError(f"{model.source}: a duration of {length} is not one; give for instance 1h, at most 1e9 s")
     size = round(duration_seconds(length, "duration") * hertz)
     if size < 1:
         raise OptionError(f"{model.source}: a duration of {length} is shorter than one sample at {hertz:g} Hz")

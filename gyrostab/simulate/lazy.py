@@ -41,7 +41,7 @@ class Chain:
 
     def __init__(self, step: Callable[[int, Any], tuple[Any, Any]], state: Any, length: int):
         self._step, self._stride = step, max(1, length // STATES)
-        self._states = {0: state}
+        self._states, self._taken = {0: state}, 0
         self._recent: dict[int, Any] = {}
         self._lock = threading.Lock()
 
@@ -49,7 +49,7 @@ class Chain:
         return {"_step": self._step, "_stride": self._stride, "_states": {0: self._states[0]}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _recent={}, _lock=threading.Lock())
+        self.__dict__.update(state, _taken=0, _recent={}, _lock=threading.Lock())
 
     def __call__(self, number: int) -> Any:
         """Result of a step."""
@@ -59,11 +59,12 @@ class Chain:
                 for place in range(known, number + 1):
                     self._recent[place], self._states[place + 1] = self._step(place, self._states[place])
                     self._forget(place)
+                self._taken = max(self._taken, number + 1)
             return self._recent[number]
 
     def go(self, number: int) -> Any:
         """Take a step and give its result, unless it was taken already; then give None."""
-        return self(number) if max(self._states) <= number else None
+        return self(number) if number >= self._taken else None
 
     def _forget(self, place: int) -> None:
         while len(self._recent) > RECENT:

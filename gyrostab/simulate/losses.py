@@ -111,6 +111,8 @@ def losses(
 
 
 def _poisson(rng: np.random.Generator, begin: float, end: float, per_hour: float) -> NDArray[np.float64]:
+    if not 0.0 <= per_hour * (end - begin) <= 1e8:
+        raise OptionError(f"{per_hour:g} gaps in an hour: give a number from 0 up, for at most 1e8 gaps in all")
     return np.sort(rng.uniform(begin, end, rng.poisson(per_hour * (end - begin) / 3600.0)))
 
 

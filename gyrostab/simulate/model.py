@@ -44,7 +44,9 @@ PROFILES: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
     "losses": (losses.losses, {"per_hour": "1", "mean": "s", "bursts_per_hour": "1", "burst": "s", "within": "1"}),
     "power_cuts": (losses.power_cuts, {"per_day": "1", "mean": "s"}),
 }
-_GIVEN = ("duration", "start", "seed")  # by the log, not by the table of a profile
+_GIVEN = ("duration", "start")  # by the log, not by the table of a profile
+_WORDS = ("channel", "unit", "axis", "first")
+_LISTS = ("points", "spans", "cuts", "depths", "circulation", "loads", "band")
 _LOG = ("rate", "duration", "start", "seed", "axes", "oversampling")
 
 
@@ -119,6 +121,10 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
             )
         if not isinstance(table, list if key in ("effect", "environment") else Mapping):
             raise OptionError(f"{where}: write {key} as {'[[' + key + ']]' if key in ('effect', 'environment') else '[' + key + ']'}")
+    for key in ("effect", "environment"):
+        for number, table in enumerate(tables.get(key, []), start=1):
+            if not isinstance(table, Mapping):
+                raise OptionError(f"{where}: {key} {number} is {table!r}, not a table; write [[{key}]] and its parameters below")
     noise, band = _noise(tables.get("noise", {}), where)
     effects = [make_effect(table, where=f"{where}, effect {number}") for number, table in enumerate(tables.get("effect", []), start=1)]
     profiles = [_profile(table, f"{where}, environment {number}") for number, table in enumerate(tables.get("environment", []), start=1)]
@@ -164,6 +170,16 @@ def _log(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     for key in ("seed", "oversampling"):
         if key in found and (not isinstance(found[key], int) or isinstance(found[key], bool) or found[key] < (key == "oversampling")):
             raise OptionError(f"{where}, [log]: {key} = {found[key]!r} is not a whole number {'above 0' if key != 'seed' else 'from 0 up'}")
+    axes = found.get("axes", ["x"])
+    if (
+        not isinstance(axes, list | tuple)
+        or not axes
+        or not all(isinstance(axis, str) and axis for axis in axes)
+        or len(set(axes)) < len(axes)
+    ):
+        raise OptionError(f'{where}, [log]: axes = {axes!r} is not a list of different names; write for instance axes = ["x", "y", "z"]')
+    if found.get("oversampling", 1) > 1000:
+        raise OptionError(f"{where}, [log]: oversampling = {found['oversampling']!r} is more than 1000")
     if "start" in found:
         found["start"] = str(found["start"])
     return found
@@ -187,11 +203,11 @@ def _check_axes(model: Model) -> None:
 
 def _profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[str, Any]]:
     name = table.get("profile")
-    if name not in PROFILES:
+    if not isinstance(name, str) or name not in PROFILES:
         what = "an environment has no profile" if name is None else f"there is no profile {name!r}{close_to(name, list(PROFILES))}"
         raise OptionError(f"{where}: {what}; there are {', '.join(PROFILES)}")
     function, units = PROFILES[str(name)]
-    arguments = {key: item for key, item in inspect.signature(function).parameters.items() if key not in _GIVEN or (key == "seed")}
+    arguments = {key: item for key, item in inspect.signature(function).parameters.items() if key not in _GIVEN}
     values = {key: value for key, value in table.items() if key != "profile"}
     for key in values:
         if key not in arguments:
@@ -200,6 +216,10 @@ def _profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[str, An
     for key, item in arguments.items():
         if item.default is inspect.Parameter.empty and key not in values:
             raise OptionError(f"{where}: profile {name!r} lacks {key!r}; see gyrostab.simulate.environment.{name} for what it holds")
+    for key, value in values.items():
+        kind, what = (str, "text") if key in _WORDS else (list | tuple, "a list") if key in _LISTS else (object, "")
+        if not isinstance(value, kind) or value == "":
+            raise OptionError(f"{where}: {key} = {value!r} is not {what or 'a value'}")
     converted = {key: amount(value, units[key], f"{where}: {key}") if key in units else value for key, value in values.items()}
     for key, unit in units.items():
         number = converted.get(key, 0.0)

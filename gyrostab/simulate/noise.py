@@ -38,6 +38,8 @@ _PIECE = 2**13
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:
     """Random numbers that belong to a seed and some names."""
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
     return np.random.default_rng([seed, *(zlib.crc32(str(name).encode()) for name in names)])
 
 
