@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["mean_changes", "play", "relax", "slab"]
+__all__ = ["mean_changes", "mean_play", "play", "relax", "slab"]
 
 Array = NDArray[np.float64]
 
@@ -49,14 +49,14 @@ def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
     >>> times.round(1), whole.round(3), halves.round(3)
     (array([265. ,  29.4,  10.6]), array([0.811, 0.09 , 0.099]), array([-0.671,  0.435,  0.237]))
     """
-    odd = 2.0 * np.arange(1, count + 1) - 1.0
-    root = odd * math.pi / 2.0
+    odd: Array = np.arange(1, 2 * count, 2, dtype=np.float64)
+    root = odd * (math.pi / 2.0)
     sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
-    whole = 2.0 / root**2
+    whole: Array = np.asarray(2.0 / root**2, dtype=np.float64)
     halves = 4.0 * sign * (sign - 2.0 * np.sin(root / 2.0)) / root**2
     whole[-1] += 1.0 - whole.sum()
     halves[-1] -= halves.sum()
-    times: Array = slowest / odd**2
+    times = np.asarray(slowest / odd**2, dtype=np.float64)
     return times, whole, halves
 
 
@@ -144,14 +144,20 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
     >>> mean_changes(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.01)
     array([0.1998, 0.2   ])
     """
+    at, line = _joined(known, values, begin, end)
+    followed = _follow(at, line, time)
+    return np.asarray((followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin))
+
+
+def _joined(known: Array, values: Array, begin: Array, end: Array) -> tuple[Array, Array]:
+    """Times and values of the polygon through the known values, with corners at the edges of intervals as well."""
     at = np.unique(np.concatenate([known, begin, end]))
     line = np.interp(at, known, values)
     if known.size > 1:
         for edge, one, other in ((at < known[0], 0, 1), (at > known[-1], -1, -2)):
             slope = (values[one] - values[other]) / (known[one] - known[other])
             line[edge] = values[one] + slope * (at[edge] - known[one])
-    followed = _follow(at, line, time)
-    return np.asarray((followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin))
+    return at, line
 
 
 @njit(cache=True, nogil=True)
@@ -182,3 +188,31 @@ def play(values: Array, width: float, start: float) -> tuple[Array, float]:
         here = max(values[i] - width, min(values[i] + width, here))
         out[i] = here
     return out, here
+
+
+def mean_play(known: Array, values: Array, begin: Array, end: Array, width: float) -> Array:
+    """Mean over intervals of the distance of T from the slider of `play`, from a few values of T that are joined by straight lines.
+
+    Parameters
+    ----------
+    known, values, begin, end : ndarray
+        As for `mean_changes`; the slider begins at T at the first of all times.
+    width : float
+        Half of the play.
+
+    Returns
+    -------
+    ndarray, shape (w,)
+
+    Examples
+    --------
+    >>> mean_play(np.array([0.0, 10.0, 20.0]), np.array([0.0, 10.0, 0.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 2.5).round(2)
+    array([ 2.19, -1.25])
+    """
+    at, line = _joined(known, values, begin, end)
+    corner = np.arange(8 * (at.size - 1) + 1) / 8.0  # the slider starts and stops between the corners of the polygon
+    at, line = np.interp(corner, np.arange(at.size), at), np.interp(corner, np.arange(at.size), line)
+    slider, _ = play(line, width, float(line[0]))
+    apart = line - slider
+    total = np.concatenate([[0.0], np.cumsum((apart[1:] + apart[:-1]) / 2.0 * np.diff(at))])
+    return np.asarray((total[np.searchsorted(at, end)] - total[np.searchsorted(at, begin)]) / (end - begin))

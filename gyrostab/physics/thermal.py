@@ -295,12 +295,11 @@ class ThermalHysteresis(Effect):
         return {"width": np.ptp(windows.drivers["temperature"]) * np.array([0.01, 0.03, 0.1, 0.2, 0.33])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means, with the play run by the window means of the temperature in the order of the windows."""
-        from gyrostab.kernels.thermal import play
+        """Window means, with the play run by the window means of the temperature joined by straight lines."""
+        from gyrostab.kernels.thermal import mean_play
 
-        temperature = np.ascontiguousarray(windows.drivers["temperature"])
-        slider, _ = play(temperature, self.width, float(temperature[0]))
-        return Prediction(mean={"sensitivity": temperature - slider})
+        apart = mean_play(windows.centre, windows.drivers["temperature"], windows.begin, windows.end, self.width)
+        return Prediction(mean={"sensitivity": apart})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

@@ -87,6 +87,8 @@ class WarmUp(Effect):
         since = chunk.seconds - on[which]
         bias = np.zeros(chunk.size)
         for (_, amplitude, time), share in zip(self._parts(), shares, strict=True):
+            if not amplitude:
+                continue
             inside = 1.0 / (chunk.rate * time)
             bias += amplitude * (-math.expm1(-inside) / inside) * share[which] * np.exp(-since / time)
         return bias, state
