@@ -258,14 +258,18 @@ class ClockError(Effect):
         def ahead(t: Any) -> Any:
             return error * t + drift * t * t / 2.0
 
-        turning = -error / drift if drift else 0.0
-        lowest = min(ahead(t) for t in (0.0, duration, min(max(turning, 0.0), duration)))
+        lowest = min(ahead(t) for t in self._extremes(duration))
         return np.asarray(ahead(seconds) - lowest)
+
+    def _extremes(self, duration: float) -> tuple[float, float, float]:
+        """Where the slip may be smallest or largest [s]: start, end, and where the error goes through zero."""
+        turning = -self.error / self.drift * _HOUR if self.drift else 0.0
+        return 0.0, duration, min(max(turning, 0.0), duration)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """No samples yet; and how many have to be kept."""
         duration = setup.size / setup.rate
-        times = np.linspace(0.0, duration, 1001)
+        times = np.array(self._extremes(duration))
         growth = (self.error + self.drift * times / _HOUR) * _PPM
         if np.abs(growth).max() > 0.3:
             raise OptionError(f"effect {self.name!r}: the clock gets wrong by {np.abs(growth).max():.0%}; make error and drift smaller")
@@ -286,12 +290,9 @@ class ClockError(Effect):
         known = np.concatenate([memory, chunk.signal], axis=1)
         start = chunk.first - keep  # sample of the instrument that known begins with
         edges = np.arange(chunk.first, chunk.first + chunk.size + 1, dtype=np.float64)
-        duration = chunk.setup.size / chunk.rate
-        read = np.maximum(edges - self.slip(edges / chunk.rate, duration) * chunk.rate, chunk.first - keep)
-        if self.reading == "latest":
-            values = known[:, np.floor(read[:-1]).astype(np.int64) - start]
-        else:
-            values = _means_between(known, read - start) / np.diff(read)
+        read = edges - self.slip(edges / chunk.rate, chunk.setup.size / chunk.rate) * chunk.rate
+        latest = self.reading == "latest"
+        values = known[:, np.floor(read[:-1]).astype(np.int64) - start] if latest else _means_between(known, start, read)
         if self.output == "angle":
             middle = (edges[:-1] + 0.5) / chunk.rate
             values = values * (1.0 - (self.error + self.drift * middle / _HOUR) * _PPM)
@@ -310,12 +311,13 @@ class ClockError(Effect):
         return f"The clock of the samples is {fast} by {number}{more} {self.on_axes()}."
 
 
-def _means_between(known: Array, read: Array) -> Array:
-    """Integral of samples that hold, from one place to the next [samples]; the places are less than two samples apart."""
+def _means_between(known: Array, start: int, read: Array) -> Array:
+    """Means of samples that hold, from one place to the next [samples], less than two apart; `known` begins with the sample `start`."""
     begin, end = read[:-1], read[1:]
-    whole = np.floor(begin).astype(np.int64)
+    whole = np.floor(begin)
+    column = whole.astype(np.int64) - start
     total = np.zeros((known.shape[0], begin.size))
     for step in range(3):
         share = np.clip(np.minimum(end, whole + step + 1) - np.maximum(begin, whole + step), 0.0, 1.0)
-        total += share * known[:, np.minimum(whole + step, known.shape[1] - 1)]
-    return total
+        total += share * known[:, np.minimum(column + step, known.shape[1] - 1)]
+    return total / (end - begin)
