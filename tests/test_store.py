@@ -322,11 +322,17 @@ def test_every_chunk_of_a_zarr_store_is_written_even_if_it_is_all_gap(tmp_path):
         assert np.isnan(back.rate[0]).all()
 
 
-def test_a_store_that_vanishes_is_no_gap(tmp_path):
-    path = to_zarr(counts_log(), tmp_path / "log.zarr")
+@pytest.mark.parametrize(("form", "said"), [("nc", "cannot be opened again"), ("zarr", "is not there any more")])
+def test_a_store_that_vanishes_is_no_gap(tmp_path, form, said):
+    path = WRITERS[form](counts_log(), tmp_path / f"log.{form}")
     with open_log(path) as log:
-        path.rename(tmp_path / "away.zarr")
-        with pytest.raises(FormatError, match="is not there any more"):
+        path.rename(tmp_path / "away")
+        with pytest.raises(FormatError, match=f"{said}.*has it been moved"):
+            log.rate.compute()
+    with open_log((tmp_path / "away").rename(path)) as log:
+        log.rate[:, :5].compute()
+        path.rename(tmp_path / "away")
+        with pytest.raises(FormatError, match=f"{said}.*has it been moved"):
             log.rate.compute()
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import json
 import sys
 import threading
 import uuid
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 from gyrostab.cf import declared_grids, decode_stamps, index_dim
 from gyrostab.errors import FormatError
 from gyrostab.kernels.counts import from_counts
-from gyrostab.store.lock import library_lock
+from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.timegrid import grid_times
 
 __all__ = ["open_stored"]
@@ -87,7 +85,7 @@ def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
         chunks = disk.get("chunks" if path.is_dir() else "chunksizes")
         if not dim.startswith("time") or variable.dtype.kind != "f" or not variable.size or chunks is None:
             continue
-        own = all(size == 1 for size in chunks[:-1]) and (not path.is_dir() or _is_plain(path / str(name)))
+        own = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name), disk)
         if not own or ("scale_factor" in disk and "_FillValue" not in disk):
             continue  # some other program has laid it out anew
         array = _Chunks(
@@ -110,33 +108,7 @@ def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
         )
         packing = {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)} if array.scale is not None else {}
         long[name] = xr.Variable(variable.dims, lazy, variable.attrs, packing)
-    close = stored._close
-    log = stored.assign(long)
-
-    def close_all() -> None:
-        if close is not None:
-            close()
-        with library_lock():
-            _opened.cache_clear()
-
-    log.set_close(close_all)
-    return log
-
-
-@lru_cache(maxsize=8)
-def _opened(path: Path, opened: str) -> Any:
-    """The file, open: once in each process for one opening of a log, and only the last few, as each takes megabytes of the library."""
-    import netCDF4
-
-    return netCDF4.Dataset(path, keepweakref=True)  # closes when it falls out of the cache
-
-
-def _is_plain(folder: Path) -> bool:
-    """Whether a Zarr array is of format 2 in rows, which `_Chunks` reads by itself."""
-    try:
-        return bool(json.loads((folder / ".zarray").read_text())["order"] == "C")
-    except (OSError, ValueError, KeyError):
-        return False
+    return stored.assign(long)
 
 
 def _spans(stored: xr.Dataset, dim: str, length: int) -> dict[str, Any] | tuple[tuple[int, int], ...]:
@@ -148,10 +120,6 @@ def _spans(stored: xr.Dataset, dim: str, length: int) -> dict[str, Any] | tuple[
         return ()
     stamps = decode_stamps(stored.variables[dim]).values.view(np.int64)
     return tuple((int(stamps[at]), int(stamps[min(at + length, stamps.size) - 1])) for at in range(0, stamps.size, length))
-
-
-class _Damage(Exception):
-    """A chunk that cannot be read; the message says why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +157,9 @@ class _Chunks:
             number = begin // self.length
             stop = min(end, (number + 1) * self.length)
             try:
-                pieces.append(self._decoded(self._zarr(row, number, begin, stop) if self.zarr else self._netcdf(row, begin, stop)))
-            except _Damage as damage:
+                inside = slice(begin - number * self.length, stop - number * self.length)
+                pieces.append(self._decoded(self._stored(row, number)[inside]))
+            except ChunkDamage as damage:
                 self._tell(row or 0, number, str(damage))
                 pieces.append(np.full(stop - begin, np.nan, self.dtype))
             begin = stop
@@ -205,40 +174,12 @@ class _Chunks:
             values[raw == self.fill] = np.nan
         return values
 
-    def _netcdf(self, row: int | None, begin: int, stop: int) -> NDArray[Any]:
-        with library_lock():
-            try:
-                variable = _opened(self.path, self.opened).variables[self.name]
-            except (OSError, KeyError) as error:
-                raise FormatError(f"{self.path}: cannot be opened again ({error}); has it been moved or changed?") from error
-            variable.set_auto_maskandscale(False)
-            if variable.get_var_chunk_cache()[0]:
-                variable.set_var_chunk_cache(size=0)  # whole chunks are read once; 16 MiB in each file of an archive is much
-            try:
-                return np.asarray(variable[begin:stop] if row is None else variable[row, begin:stop])
-            except (OSError, RuntimeError) as error:
-                raise _Damage(f"is damaged: {error}") from error
-
-    def _zarr(self, row: int | None, number: int, begin: int, stop: int) -> NDArray[Any]:
-        folder = self.path / self.name
-        codecs, dtype, separator = _zarr_layout(folder, self.opened)
-        name = str(number) if row is None else f"{row}{separator}{number}"
-        try:
-            data = (folder / name).read_bytes()
-            for codec in codecs:
-                data = codec.decode(data)
-            whole = np.frombuffer(data, dtype)
-        except FileNotFoundError as error:
-            if not folder.is_dir():
-                raise FormatError(f"{folder}: is not there any more; has it been moved or removed?") from error
-            raise _Damage(f"is missing: no file {self.name}/{name}") from error
-        except (OSError, RuntimeError, ValueError) as error:
-            if isinstance(error, OSError) and error.errno not in (None, errno.EIO):
-                raise FormatError(f"{folder / name}: cannot be read ({error.strerror})") from error
-            raise _Damage(f"is damaged: {self.name}/{name}: {' '.join(str(error).split())}") from error
+    def _stored(self, row: int | None, number: int) -> NDArray[Any]:
+        """One chunk as it lies on disk; the last of a row has room for more than there is."""
+        whole = read_chunk(self.path, self.name, (number,) if row is None else (row, number), zarr=self.zarr, opened=self.opened)
         if whole.size != self.length:
-            raise _Damage(f"is damaged: {self.name}/{name} holds {whole.size} values in place of {self.length}")
-        return whole[begin - number * self.length : stop - number * self.length]
+            raise ChunkDamage(f"is damaged: it holds {whole.size} values in place of {self.length}")
+        return whole
 
     def _tell(self, row: int, number: int, damage: str) -> None:
         """Warn of a damaged chunk, once; or stop at it."""
@@ -254,19 +195,6 @@ class _Chunks:
             raise FormatError(f"{what}; copy it again, or leave out --strict to take these samples as missing")
         with _TELLING:
             _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
-
-
-@lru_cache(maxsize=256)
-def _zarr_layout(folder: Path, opened: str) -> tuple[list[Any], np.dtype[Any], str]:
-    """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk; looked up once an opening."""
-    import numcodecs
-
-    try:
-        layout = json.loads((folder / ".zarray").read_text())
-    except OSError as error:
-        raise FormatError(f"{folder}: is not there any more ({error.strerror}); has it been moved or removed?") from error
-    codecs = [numcodecs.get_codec(item) for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item]
-    return codecs, np.dtype(layout["dtype"]), layout.get("dimension_separator", ".")
 
 
 _TELLING = threading.Lock()

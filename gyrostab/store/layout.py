@@ -1,0 +1,199 @@
+"""Where the chunks of a variable lie on disk, and how their bytes become numbers: NetCDF (HDF5) and Zarr (format 2).
+
+Chunks of NetCDF files are read without its library. That holds a lock over every read, and keeps each chunk for as long as any handle
+of the file is open; the places and filters of the chunks are all that it takes to read them side by side, with no file left open.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError
+from gyrostab.store.lock import library_lock
+
+__all__ = ["ChunkDamage", "is_readable", "read_chunk"]
+
+#: Variables of files whose layout is remembered: some for each file of a long archive.
+_REMEMBERED = 2**12
+#: Numbers of the filters of HDF5 that are known here.
+_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD = 1, 2, 3, 32015
+
+
+class ChunkDamage(Exception):
+    """A chunk that cannot be read; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Hdf5Layout:
+    """Type, filters in the order of reading, and for each chunk its byte, its size, and a bit for each filter that it went round."""
+
+    dtype: np.dtype[Any]
+    codecs: tuple[tuple[int, Any], ...]
+    places: dict[tuple[int, ...], tuple[int, int, int]]
+    damage: str
+
+
+@dataclass(frozen=True)
+class _ZarrLayout:
+    dtype: np.dtype[Any]
+    codecs: tuple[Any, ...]
+    separator: str
+
+
+def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:
+    """Whether `read_chunk` knows the layout of a variable, with the encoding that xarray tells of it.
+
+    Any log that gyrostab wrote is known; some other program may have laid it out anew.
+    """
+    if not path.is_dir():
+        return not any(encoding.get(filters) for filters in ("szip", "bzip2", "blosc"))
+    try:
+        return bool(json.loads((path / name / ".zarray").read_text())["order"] == "C")
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def read_chunk(path: Path, name: str, place: tuple[int, ...], *, zarr: bool, opened: str) -> NDArray[Any]:
+    """Read one chunk as it lies on disk, not scaled: all samples that it has room for.
+
+    Parameters
+    ----------
+    path : Path
+        NetCDF file or Zarr directory.
+    name : str
+        Variable.
+    place : tuple of int
+        Number of the chunk along each dimension.
+    zarr : bool
+        It is a Zarr directory.
+    opened : str
+        Stands for one opening of the file; its layout is looked up once for each.
+
+    Raises
+    ------
+    ChunkDamage
+        When the chunk is damaged or missing.
+    FormatError
+        When there is no such file any more, or it may not be read.
+    """
+    return _zarr_chunk(path / name, place, opened) if zarr else _hdf5_chunk(path, name, place, opened)
+
+
+def _hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> NDArray[Any]:
+    layout = _hdf5_layout(path, name, opened)
+    if place not in layout.places:
+        raise ChunkDamage(f"is damaged: {layout.damage}" if layout.damage else f"is missing: {name} has no chunk {place}")
+    begin, size, mask = layout.places[place]
+    try:
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        try:
+            data: Any = _bytes_at(handle, begin, size)
+        finally:
+            os.close(handle)
+        if len(data) < size:
+            raise ChunkDamage("is missing: the file is cut short")
+        for number, codec in layout.codecs:
+            if not mask >> number & 1:
+                data = codec.decode(data)
+        return np.frombuffer(data, layout.dtype)
+    except OSError as error:
+        if error.errno not in (None, errno.EIO):
+            raise FormatError(f"{path}: cannot be opened again ({error.strerror}); has it been moved or changed?") from error
+        raise ChunkDamage(f"is damaged: {error}") from error
+    except (RuntimeError, ValueError) as error:
+        raise ChunkDamage(f"is damaged: {' '.join(str(error).split())}") from error
+
+
+def _bytes_at(handle: int, begin: int, size: int) -> bytes:
+    os.lseek(handle, begin, os.SEEK_SET)
+    data = os.read(handle, size)
+    while 0 < len(data) < size and (more := os.read(handle, size - len(data))):
+        data += more
+    return data
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
+    """The places of the chunks; those of a damaged index that can be read."""
+    import h5py
+
+    places: dict[tuple[int, ...], tuple[int, int, int]] = {}
+    damage = ""
+    with library_lock():
+        try:
+            with h5py.File(path, "r") as file:
+                variable = file[name]
+                dtype, codecs = variable.dtype, _hdf5_codecs(variable.id.get_create_plist())
+
+                def note(chunk: Any) -> None:
+                    number = tuple(at // length for at, length in zip(chunk.chunk_offset, variable.chunks, strict=True))
+                    places[number] = (chunk.byte_offset, chunk.size, chunk.filter_mask)
+
+                try:
+                    variable.id.chunk_iter(note)
+                except (RuntimeError, ValueError) as error:
+                    damage = f"the index of {name} cannot be read ({error})"
+        except (OSError, KeyError) as error:
+            raise FormatError(f"{path}: cannot be opened again ({error}); has it been moved or changed?") from error
+    return _Hdf5Layout(dtype, codecs, places, damage)
+
+
+def _hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
+    """Filters as codecs, in the order of reading, each with its number in the pipeline."""
+    from numcodecs import Fletcher32, Shuffle, Zlib, Zstd
+
+    codecs = []
+    for number in reversed(range(plist.get_nfilters())):
+        code, _, values, _ = plist.get_filter(number)
+        made = {_DEFLATE: Zlib, _FLETCHER32: Fletcher32, _ZSTD: Zstd}.get(code)
+        codecs.append((number, Shuffle(elementsize=values[0]) if code == _SHUFFLE else made() if made else _Unknown(code)))
+    return tuple(codecs)
+
+
+@dataclass(frozen=True)
+class _Unknown:
+    code: int
+
+    def decode(self, data: bytes) -> bytes:
+        raise ChunkDamage(f"cannot be read: it went through filter {self.code} of HDF5, which gyrostab does not know")
+
+
+def _zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]:
+    layout = _zarr_layout(folder, opened)
+    name = layout.separator.join(map(str, place))
+    try:
+        data = (folder / name).read_bytes()
+        for codec in layout.codecs:
+            data = codec.decode(data)
+        return np.frombuffer(data, layout.dtype)
+    except FileNotFoundError as error:
+        if not folder.is_dir():
+            raise FormatError(f"{folder}: is not there any more; has it been moved or removed?") from error
+        raise ChunkDamage(f"is missing: no file {folder.name}/{name}") from error
+    except (OSError, RuntimeError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno not in (None, errno.EIO):
+            raise FormatError(f"{folder / name}: cannot be read ({error.strerror})") from error
+        raise ChunkDamage(f"is damaged: {folder.name}/{name}: {' '.join(str(error).split())}") from error
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
+    """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk."""
+    import numcodecs
+
+    try:
+        layout = json.loads((folder / ".zarray").read_text())
+    except OSError as error:
+        raise FormatError(f"{folder}: is not there any more ({error.strerror}); has it been moved or removed?") from error
+    codecs = tuple(numcodecs.get_codec(item) for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item)
+    return _ZarrLayout(np.dtype(layout["dtype"]), codecs, layout.get("dimension_separator", "."))
