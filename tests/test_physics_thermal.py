@@ -347,6 +347,11 @@ def test_light_power_that_makes_no_sense_is_refused():
         level(dark, drivers={"light_power": [1e-4, 1e-4, 0, 1e-4, 1e-4]}, N=1)
 
 
+def test_excess_noise_does_not_depend_on_the_light():
+    found = level({"name": "light_power_noise", "thermal": 0.0}, drivers={"light_power": [1e-4, 1e-5, 1e-6, 1e-3, 1.0]}, N=0.3)["N"]
+    np.testing.assert_array_equal(found, 0.3**2)
+
+
 def test_squared_noise_ages_with_a_power_of_time():
     found = level({"name": "ageing_noise", "growth": 0.5, "exponent": 2}, size=4, rate=1 / HOUR, N=[1.0, 2.0, 0.0])["N"]
     np.testing.assert_allclose(found, np.outer([1.0, 4.0, 0.0], 1 + 0.5 * np.array([0.5, 1.5, 2.5, 3.5]) ** 2), rtol=1e-12)
@@ -417,7 +422,10 @@ def test_a_walk_is_inside_the_windows_and_stays_where_rectification_is_at_the_ed
     assert np.all(inside.avar.values[:, [0, 2, 12, 14]] < 1e-12)
     other = davar(step, window="200s", step="50s", taus=taus)
     assert np.all(other.avar.values[:, 7] < 1e-12)
-    assert np.all(other.avar.values[:, 3] > 1e-5)
+    tau = other.tau.values
+    edge = 0.8**2 * tau / (3 * (200 - 2 * tau)) * (1 + 0.5 / (tau * 50) ** 2)  # a step between two samples is sharper than one of a walk
+    np.testing.assert_allclose(other.avar.values[:, 3], np.tile(edge, (2, 1)), rtol=1e-3)  # 150 to 350 s
+    assert math.sqrt(3 * other.avar.values[0, 3, 2] / tau[2] * HOUR) == pytest.approx(3.4, rel=0.01)
     ends = walk.rate.values[:, -1]
     assert np.all(ends == walk.rate.values[:, 31_000])
     assert np.all(np.abs(ends) > 1e-3)

@@ -91,8 +91,9 @@ class Shupe(Effect):
 
     References
     ----------
-    Shupe 1980, Appl. Opt. 19, 654; Mohr and Schadt 2004, Proc. SPIE 5502, 410 (elasto-optic part); Senol et al. 2024, Sci. Rep. (0.05 deg/h
-    left at any ramp after trimming); Carslaw and Jaeger 1959 (the modes). A winding of 12 mm with kappa = 2.2e-7 m^2/s has a lag of
+    Shupe 1980, Appl. Opt. 19, 654; Mohr and Schadt 2004, Proc. SPIE 5502, 410 (elasto-optic part); Zhuo and Du, Shupe effect of fiber
+    sensing coils in multidimensional thermal field (the second part); Senol et al. 2024, Sci. Rep. (0.05 deg/h left at any ramp after
+    trimming); Carslaw and Jaeger 1959 (the modes). A winding of 12 mm with kappa = 2.2e-7 m^2/s has a lag of
     265 s (estimate); a coil of 500 m and 4 cm whose halves differ by 0.1 % of a ramp of 1 degC/min reads about 0.3 deg/h.
 
     Examples
@@ -109,6 +110,7 @@ class Shupe(Effect):
     references: ClassVar[tuple[str, ...]] = (
         "Shupe 1980, Appl. Opt. 19, 654",
         "Mohr and Schadt 2004, Proc. SPIE 5502, 410",
+        "Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field",
         "Senol et al. 2024, Sci. Rep.",
     )
 
@@ -185,8 +187,9 @@ class ThermalGradient(Effect):
 
     References
     ----------
-    Zhuo and Du, multidimensional thermal field of quadrupole coils; Jo et al., J. Korea Inst. Mil. Sci. Technol. (bias by the changes of
-    temperature and of its gradient, three times smaller after compensation). Sizes are estimates: 0.01 to 1 deg/h/degC.
+    Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field (bias by the difference of dT/dt between the sides of
+    a coil); Jo et al., J. Korea Inst. Mil. Sci. Technol. (by temperature and its gradient; three times smaller after compensation).
+    Sizes are estimates: 0.01 to 1 deg/h/degC.
 
     Examples
     --------
@@ -200,7 +203,7 @@ class ThermalGradient(Effect):
     channels: ClassVar[Mapping[str, str]] = dict.fromkeys(("temperature", "temperature_2"), INNER["temperature"])
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "change")
     references: ClassVar[tuple[str, ...]] = (
-        "Zhuo and Du, multidimensional thermal field of quadrupole coils",
+        "Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field",
         "Jo et al., J. Korea Inst. Mil. Sci. Technol.",
     )
 
