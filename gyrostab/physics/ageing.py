@@ -56,7 +56,7 @@ class AgeingBias(Effect):
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Where the logarithm bends: from a fraction of the record to many of it."""
         length = (windows.end[-1] - windows.begin[0]) / _HOUR
-        return {"time": length * np.array([0.03, 0.1, 0.3, 1.0, 3.0])}
+        return {"time": np.maximum(length * np.array([0.03, 0.1, 0.3, 1.0, 3.0]), 1e-3)}
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means of both parts."""
