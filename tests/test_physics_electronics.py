@@ -461,6 +461,14 @@ def test_the_lattice_adds_a_twelfth_of_its_square_or_swallows_all():
     assert make_effect({"name": "rate_quantization", "step": 2.0, "mode": "floor"}).explain(windows_of(9, 1.0, 3.0)).mean["step"][0] == -0.5
 
 
+def test_a_real_gyro_stands_on_its_lattice(recordings):
+    with gzip.open(recordings("mems-static-53min/ch104.csv.gz"), "rt") as file:
+        measured = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(0, 1, 2), max_rows=5000).T * 3600
+    for step, stands in ((36.0, True), (72.0, False)):
+        done = run(make_effect({"name": "rate_quantization", "step": step}), size=5000, rate=100.0, signal=measured)
+        assert np.allclose(done, measured, atol=1e-6) == stands
+
+
 def test_bit_errors_are_bits():
     counts = np.random.default_rng(8).integers(-100, 100, (2, 50_000)).astype(float)
     effect = make_effect({"name": "spikes", "per_hour": 3600, "lsb": 0.25, "bits": 8})

@@ -89,7 +89,7 @@ class BiasJump(Effect):
     ``b = J_1 + J_2 + ...``, with normal J of the rms `restart` each time power comes back, and of the rms `shock` at random times;
     and the step `step` at the time `at`. A shock concerns all axes, with sizes of their own.
 
-    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` in the windows W across a jump D, if it lies in their middle third: an apparent
+    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` in the windows W across a jump D, at least 2 tau from their ends: an apparent
     ``K = D / sqrt(W)``, gone in windows wholly before or after. *Window mean*: steps and stays. *Spectrum*: nothing between the
     jumps. *Axes*: at the same times, with sizes and signs that have nothing to do with each other.
 

@@ -34,9 +34,9 @@ class LoggerFilter(Effect):
     n-th of them, n the `oversampling` of the model, so that what the filter lets through above half of the log's rate folds down. All
     are causal and remember from chunk to chunk.
 
-    *DAVAR*: less at times below ``1 / cutoff`` or `length`, slope -1 of the variance further up unchanged: a deficit at the left end,
-    down to sigma ~ tau^0. Picked without a filter: more white noise at all times, n times the variance. *Window mean*: nothing.
-    *Spectrum*: multiplied by ``sum_k |H(f + k fs)|^2``. *Axes*: all alike.
+    *DAVAR*: less at times below ``1 / cutoff`` or `length`, where sigma grows with tau as if of K or R; nothing at long times. Picked
+    without a filter: more white noise at all times, n times the variance. *Window mean*: nothing. *Spectrum*: multiplied by
+    ``sum_k |H(f + k fs)|^2``. *Axes*: all alike.
 
     Confused with a smaller N (look at long times), negative Q, held_samples, and a wrong sampling rate (lines move): the spectrum
     up to 0.3 fs decides.
@@ -149,7 +149,8 @@ class RateQuantization(Effect):
 
     References
     ----------
-    Widrow and Kollar 2008, Quantization Noise (q^2 / 12). Sizes: 0.1 arcsec in 10 ms is 36 000 nrad/s or 10 deg/h in a common file format.
+    Widrow and Kollar 2008, Quantization Noise (q^2 / 12). Sizes: recordings of an ADIS16405 and a CH104 stand on lattices of 180 and 36
+    deg/h; 0.1 arcsec in 10 ms, in a common file format, is 10 deg/h.
 
     Examples
     --------
@@ -274,8 +275,8 @@ class HeldSamples(Effect):
     From random times on, all axes together, as many samples as `length` says on average (at least one; without memory) are filled.
 
     *DAVAR*: ``repeat``: less at one sample, by the share of held ones; more at long times, where one sample counts for many: N^2 grows
-    by ``1 + 2 p m^2`` for m samples with the chance p. ``zero``: ``2 share w^2 / k``-like noise of the mean rate w. *Window mean*:
-    pulled to zero by "zero". *Spectrum*: less at the top, more below. *Axes*: the same samples.
+    by the factor ``1 + 2 p m^2`` for m samples with the chance p. ``zero``: pulses as high as the rate. *Window mean*: pulled to zero
+    by "zero". *Spectrum*: less at the top, more below. *Axes*: the same samples.
 
     Confused with logger_filter and small noise (no runs), clipping (runs at the limit only), real gaps: runs of equal values, which noise
     does not make.
