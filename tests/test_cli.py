@@ -138,7 +138,7 @@ BAD_INPUT = {
         lambda folder: [write_log(folder / "good.csv"), "-o", _folder(folder / "out.nc"), "--overwrite"],
         "out.nc' is a directory",
     ),
-    "damaged log of ours": (_damaged_log, r"bad\.nc: is damaged"),
+    "damaged log of ours": (_damaged_log, r"bad\.nc: .*is damaged"),
     "window without a unit": (_bad_log("--window", "20", "--step", "5s"), "window|20"),
     "window that is no duration": (_bad_log("--window", "long"), "long"),
     "axis that is not there": (_bad_log("--axis", "w", *WINDOW), "axis|'w'"),

@@ -53,6 +53,6 @@ def from_counts(counts: NDArray[np.integer[Any]], scale: float, fill: int) -> ND
     >>> from_counts(np.array([1, -32767, 3], dtype="i2"), 0.1, -32767)
     array([0.1, nan, 0.3])
     """
-    values = np.multiply(counts, np.float64(scale), dtype=np.float64)
+    values: NDArray[np.float64] = np.multiply(counts, np.float64(scale), dtype=np.float64)
     values[counts == fill] = np.nan
     return values
