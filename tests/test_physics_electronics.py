@@ -135,7 +135,7 @@ def test_a_telegraph_is_a_gauss_markov_process_to_second_order_but_has_two_level
     taus = np.array([0.2, 2.0, 10.0, 37.8, 100.0])
     expected = gauss_markov_avar(0.2 * math.sqrt(share * (1 - share)), 20.0, taus)
     np.testing.assert_allclose(avar(rates, 5.0, taus).mean(axis=0), expected, rtol=0.06)
-    assert kurtosis(rates[0]) < -1.0  # 1 / (p (1 - p)) - 6 = -1.5
+    assert kurtosis(rates, axis=1).mean() == pytest.approx(1 / (share * (1 - share)) - 6, abs=0.15)
     assert abs(np.corrcoef(rates)[0, 1]) < 0.1
 
 
@@ -333,6 +333,48 @@ def test_shared_noise_shows_in_the_cross_axis_covariance_only():
     plus, minus = avar([x + z, x - z], 20.0, taus) * taus / 3600
     assert np.all(np.abs(plus - minus)[:2] / 4 < 0.1 * 0.004 * 0.003)
     assert make_effect(effect).explain(windows_of(100, 20.0, 1.0)).coherent
+
+
+# ----------------------------------------------------------------------------------------------------- means that are said
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"name": "supply_bias", "voltage": 0.02, "power": -0.003},
+        {"name": "clock_error", "error": 100, "drift": -400},
+        {"name": "bias_jump", "step": -0.2, "at": 33.3},
+        {"name": "fringe_hop", "order": -2, "at": 41.7, "hold": 1e9},
+        {"name": "dead_zone", "width": 0.3, "centre": 1.0},
+        {"name": "dead_zone", "width": 0.3, "bandwidth": 0.05},
+        {"name": "feedback_reset", "kick": 20.0, "tail": 30.0},
+        {"name": "rate_quantization", "step": 0.01, "mode": "floor"},
+    ],
+    ids=lambda table: "-".join(map(str, table.values())),
+)
+def test_window_means_are_those_that_are_said(table):
+    effect, t = make_effect(table), np.arange(6000) / 50.0
+    drivers = {"supply_voltage": 25 + np.sin(t / 9), "light_power": 1e-4 + 1e-5 * np.cos(t / 7)}
+    signal = np.array([[150.0], [-400.0]]) + 0.05 * np.sin(3 * t)
+    done = run(effect, size=6000, rate=50.0, axes="xy", drivers=drivers, signal=signal)
+    done = done - signal if effect.stage != "rate" else done
+    means = {name: values.reshape(12, 500).mean(axis=1) for name, values in drivers.items()}
+    own = {axis: values.reshape(12, 500).mean(axis=1) for axis, values in zip("xy", signal, strict=True)}
+    said = effect.explain(windows_of(6000, 50.0, 10.0, axes=("x", "y"), drivers=means, own=own)).mean
+    total = sum(np.atleast_1d(getattr(effect, name))[0] * design for name, design in said.items())
+    found = done.reshape(2, 12, 500).mean(axis=2)
+    tolerance = 0.04 if effect.name in ("feedback_reset", "rate_quantization", "clock_error") else 1e-6  # parts of a turn, a step, a sample
+    np.testing.assert_allclose(found, np.broadcast_to(total, (2, 12)), rtol=1e-3, atol=tolerance * np.abs(total).max())
+
+
+def test_what_has_a_memory_begins_as_if_it_had_been_there_long():
+    many = [f"a{number}" for number in range(2500)]
+    first = run(make_effect({"name": "telegraph", "step": 1.0, "low": 300, "high": 100}), size=1, axes=many)
+    assert (first > 0.5).mean() == pytest.approx(0.25, abs=0.03)
+    first = run(make_effect({"name": "gauss_markov", "rms": 2.0, "correlation_time": 50}), size=1, axes=many)
+    assert first.std() == pytest.approx(2.0, rel=0.05)
+    steady = run(make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=2.0)
+    np.testing.assert_allclose(steady, 1.7, rtol=1e-12)
 
 
 # -------------------------------------------------------------------------------------------------- densities that are said
