@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 #: Correlation times of the slow part [share of the record], and its spectral density against the white part's at one cycle per record.
 _TIMES = (0.03, 0.1, 0.3, 1.0, 10.0)
 _RATIOS = (1.0, 4.0, 16.0, 64.0, 1e3, 1e4, 1e6)
-_WHITE_PRIOR = 30.0  # against the correlation time for each slow law: a short memory must show itself in the data
+_WHITE_PRIOR = 150.0  # against the correlation time for each slow law: a short memory must show itself in the data
 _TAIL = 60  # smallest of the simulated p-values, from which the law of still smaller ones is taken
 _STEEPEST = 1.5  # power of the share against the p-value in the tail, at most
 
