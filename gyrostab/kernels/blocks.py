@@ -16,17 +16,18 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
+from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.vectors import TOGETHER, split_sums
 
-__all__ = ["full_counts", "grouped_blocks", "windows_from_blocks"]
+__all__ = ["full_counts", "grouped_blocks", "groups", "windows_from_blocks"]
 
 # Points of the angle in one pass: what several averaging factors read of them stays in the first-level cache.
 _TILE = 2048
 
 
-@njit(nogil=True, cache=True)
-def _groups(shifts):  # type: ignore[no-untyped-def]
+def groups(shifts: NDArray[np.int64]) -> NDArray[np.int64]:
     """First averaging factor of each group that goes through the angle together (one shift, `TOGETHER` at most), and the end."""
     first = [0]
     while first[-1] < shifts.size:
@@ -37,7 +38,7 @@ def _groups(shifts):  # type: ignore[no-untyped-def]
     return np.array(first)
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _limit(i, count, first, low, high, stop, step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):  # type: ignore[no-untyped-def]
     """Terms of the head and of head and tail, from `first` on, of `count` averaging factors from number i on; the most of them."""
     shift = shifts[i]
@@ -55,17 +56,17 @@ def _limit(i, count, first, low, high, stop, step, block, n_windows, ks, shifts,
     return largest
 
 
-@njit(nogil=True, cache=True)
-def grouped_blocks(flat, places, starts, stops, step, ks, shifts, head_lengths, whole, n_windows, counted):  # type: ignore[no-untyped-def]
+@njit(**KERNEL)
+def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, counted):  # type: ignore[no-untyped-def]
     """Heads and tails of every block and averaging factor, (n_blocks, n_tau), and their numbers of terms if `counted`.
 
-    `starts`, `stops` are runs of present points of the angle; ``flat[places[i]:]`` is the angle thinned by ``2**shifts[i]``.
+    `starts`, `stops` are runs of present points of the angle; ``flat[places[i]:]`` is the angle thinned by ``2**shifts[i]``;
+    `whole` is not rising.
     """
-    n_blocks = n_windows + whole.max()
+    n_blocks = n_windows + whole[0]
     n_counted = n_blocks if counted else 0
     heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     head_counts, tail_counts = np.zeros((n_counted, ks.size)), np.zeros((n_counted, ks.size))
-    groups = _groups(shifts)
     near = np.zeros(groups.size, np.int64)
     lags = ks >> shifts
     splits, sizes, out = np.empty(TOGETHER, np.int64), np.empty(TOGETHER, np.int64), np.empty(2 * TOGETHER)
@@ -98,7 +99,7 @@ def grouped_blocks(flat, places, starts, stops, step, ks, shifts, head_lengths, 
     return heads, tails, head_counts, tail_counts
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _slide(heads, tails, length, first, stop, out):  # type: ignore[no-untyped-def]
     """Windows of `length` whole blocks and one head, columns `first` to `stop`: per group of `length` windows two running sums."""
     n = out.shape[0]
@@ -120,11 +121,11 @@ def _slide(heads, tails, length, first, stop, out):  # type: ignore[no-untyped-d
                 prefix[i] += head[i] + tail[i]
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-untyped-def]
     """``out[j, i] = sum(heads[j : j + whole[i], i] + tails[...]) + heads[j + whole[i], i]``, additions only."""
     out = np.empty((n_windows, whole.size))
-    first = 0
+    first = np.int64(0)
     while first < whole.size:
         stop = first + 1
         while stop < whole.size and whole[stop] == whole[first]:
@@ -132,17 +133,15 @@ def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-unty
         if whole[first] > 0:
             _slide(heads, tails, whole[first], first, stop, out)
         else:
-            out[:, first:stop] = heads[:n_windows, first:stop]
+            for j in range(n_windows):
+                for i in range(first, stop):
+                    out[j, i] = heads[j, i]
         first = stop
     return out
 
 
-@njit(nogil=True, cache=True)
-def full_counts(window, step, n_windows, ks, shifts):  # type: ignore[no-untyped-def]
+def full_counts(window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:
     """Terms of each window without gaps, (n_windows, n_tau)."""
-    full = np.empty((n_windows, ks.size))
-    for j in range(n_windows):
-        for i in range(ks.size):
-            up = (1 << shifts[i]) - 1
-            full[j, i] = ((j * step + window - 2 * ks[i] + 1 + up) >> shifts[i]) - ((j * step + up) >> shifts[i])
-    return full
+    up = (1 << shifts) - 1
+    first = step * np.arange(n_windows)[:, None] + up
+    return (((first + window - 2 * ks + 1) >> shifts) - (first >> shifts)).astype(np.float64)

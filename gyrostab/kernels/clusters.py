@@ -10,10 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.compiled import INNER
+
 __all__ = ["cluster_cell", "cluster_prefix"]
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def cluster_prefix(starts, stops, n):  # type: ignore[no-untyped-def]
     """From runs of present samples: the mask (n,), and the number of present samples and of run starts before each, (n + 1,)."""
     present = np.zeros(n, np.bool_)
@@ -32,21 +34,21 @@ def cluster_prefix(starts, stops, n):  # type: ignore[no-untyped-def]
     return present, samples, runs
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _runs_within(runs, present, a, b):  # type: ignore[no-untyped-def]
     """Runs of present samples that touch [a, b)."""
     continued = a > 0 and present[a - 1] and a < present.size and present[a]
     return runs[b] - runs[a] + (1 if continued else 0)
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _common(samples, a1, b1, a2, b2):  # type: ignore[no-untyped-def]
     """Present samples in the intersection of [a1, b1) and [a2, b2)."""
     a, b = max(a1, a2), min(b1, b2)
     return samples[b] - samples[a] if b > a else 0
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _gap_factor(samples, first, length, k):  # type: ignore[no-untyped-def]
     """Degrees of freedom under white noise, seen through this mask, as a share of the gap-free window's."""
     stride = max(1, k // 4)
@@ -85,7 +87,7 @@ def _gap_factor(samples, first, length, k):  # type: ignore[no-untyped-def]
     return expected * expected / variance * full / (float(total) * total)
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def cluster_cell(theta, present, samples, runs, first, window, k):  # type: ignore[no-untyped-def]
     """One cell of the surface by weighted cluster means.
 

@@ -20,6 +20,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_continuous_lyapunov
 
+from gyrostab.kernels.compiled import KERNEL
+
 __all__ = ["ORDER", "Reading", "band", "band_psd", "folded_psd", "march", "oscillator", "oscillator_psd", "rest"]
 
 Array = NDArray[np.float64]
@@ -149,7 +151,7 @@ def rest(reading: Reading, normal: Array) -> Array:
     return np.asarray(reading.spread @ normal)
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL)
 def march(step: Array, read: Array, kick: Array, normal: Array, position: Array) -> tuple[Array, Array]:
     """Read the process at the samples.
 

@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.nonnegative import REORDER
 
 __all__ = ["STOCHASTIC", "diagonal_products", "pair_products", "product_tables"]
@@ -32,7 +33,7 @@ _FINE = 32
 _FLICKER = 1.0 / (2.0 * math.pi)
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _smooth(lag, k1, k2, logarithm, out):  # type: ignore[no-untyped-def]
     """Covariance of d_k1[m] and d_k2[m + lag] over 2 k1 k2, for the terms N, B and K (entries 1..3 of `out`)."""
     white = 0.0
@@ -52,7 +53,7 @@ def _smooth(lag, k1, k2, logarithm, out):  # type: ignore[no-untyped-def]
     out[3] = walk / 12.0 * scale
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _quantization(lag, k1, k2):  # type: ignore[no-untyped-def]
     """The same for white angle noise: nonzero only where points of both second differences coincide."""
     total = 0.0
@@ -63,13 +64,13 @@ def _quantization(lag, k1, k2):  # type: ignore[no-untyped-def]
     return total / (2.0 * k1 * k2)
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _weight(lag, n1, n2):  # type: ignore[no-untyped-def]
     """Number of pairs of terms with this lag."""
     return max(0, min(n1, n2 - lag) - max(0, -lag))
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _add_smooth(window, k1, k2, logarithm, products, means):  # type: ignore[no-untyped-def]
     """Add the pairs of the terms N, B and K, whose covariances are smooth in the lag on the scale of the shorter factor."""
     n1, n2 = window - 2 * k1 + 1, window - 2 * k2 + 1
@@ -88,7 +89,7 @@ def _add_smooth(window, k1, k2, logarithm, products, means):  # type: ignore[no-
                 products[a, b] += weight * r[a] * r[b]
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type: ignore[no-untyped-def]
     """Add the pairs of white angle noise with every term: at most nine lags, met `thin` times as often by thinned terms."""
     n1, n2 = window - 2 * k1 + 1, window - 2 * k2 + 1
@@ -110,7 +111,7 @@ def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type
             products[b, 0] += weight * r[0] * r[b]
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _differences(k, logarithm, out):  # type: ignore[no-untyped-def]
     """Second differences at distance k of the three autocovariances, at every whole lag; lag 0 is in the middle of `out`."""
     middle = out.shape[1] // 2
@@ -130,7 +131,7 @@ def _differences(k, logarithm, out):  # type: ignore[no-untyped-def]
         out[2, middle + lag] = out[2, middle - lag] = walk / 12.0
 
 
-@njit(nogil=True, cache=True, fastmath=REORDER)
+@njit(fastmath=REORDER, **INNER)
 def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no-untyped-def]
     """What `_add_smooth` adds where it takes every lag, from `_differences` of k1 <= k2.
 
@@ -166,7 +167,7 @@ def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no
     products[2, 3] = products[3, 2] = bk
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _sum_pairs(window, k1, k2, thin, logarithm, differences, products, means):  # type: ignore[no-untyped-def]
     """Products ``r_a r_b`` and values ``r_a`` averaged over all pairs of terms; `differences` may be empty."""
     products[:] = 0.0
@@ -183,7 +184,7 @@ def _sum_pairs(window, k1, k2, thin, logarithm, differences, products, means):  
             products[a, b] /= pairs
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def _tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     n_tau = ks.size
     products = np.zeros((STOCHASTIC, STOCHASTIC, n_tau, n_tau))
@@ -236,7 +237,7 @@ def pair_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64])
     return product_tables(window, ks, shifts)[0]
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def _diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     products = np.zeros((STOCHASTIC, STOCHASTIC, ks.size))
     means = np.zeros((STOCHASTIC, ks.size))

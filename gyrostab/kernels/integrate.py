@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
+from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.vectors import LANES, TOGETHER
 
 __all__ = [
@@ -28,18 +30,22 @@ _FAST = {"reassoc", "contract", "nsz", "arcp"}
 _TILE = 4096
 # Samples that are looked at one by one where some of them are missing.
 _LOOK = 512
+# Samples that are seen together to be all present or all missing.
+_STRIP = 64
+# Samples in which the first present one is looked for at once.
+_SEARCH = 4096
 
 
-@njit(nogil=True, cache=True)
-def first_present(x):  # type: ignore[no-untyped-def]
+def first_present(x: NDArray[np.generic]) -> float:
     """First finite value of `x` as double, NaN where there is none."""
-    for i in range(x.size):
-        if np.isfinite(x[i]):
-            return float(x[i])
+    for a in range(0, x.size, _SEARCH):
+        found = np.flatnonzero(np.isfinite(x[a : a + _SEARCH]))
+        if found.size:
+            return float(x[a + found[0]])
     return np.nan
 
 
-@njit(nogil=True, cache=True, fastmath=_FAST)
+@njit(fastmath=_FAST, **INNER)
 def _sum(x, base):  # type: ignore[no-untyped-def]
     total = 0.0
     for i in range(x.size):
@@ -47,7 +53,7 @@ def _sum(x, base):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _sum_present(x, base):  # type: ignore[no-untyped-def]
     """Sum of ``x - base`` over finite samples, and their number."""
     total = 0.0
@@ -66,7 +72,7 @@ def _sum_present(x, base):  # type: ignore[no-untyped-def]
     return total, count
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def]
     """Heads and tails, (n_blocks, 2) each: sum of ``x - base`` over present samples, and their number."""
     whole = window // step
@@ -80,36 +86,47 @@ def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def
     return heads, tails
 
 
-@njit(nogil=True, cache=True)
-def present_runs(x):  # type: ignore[no-untyped-def]
-    """First and one-past-last index of every run of finite samples: two int64 arrays."""
-    starts = np.empty(16, np.int64)
-    stops = np.empty(16, np.int64)
+@njit(**INNER)
+def _edges(x, starts, stops):  # type: ignore[no-untyped-def]
+    """Number of runs of finite samples; the first of them, as many as there is room for, to `starts` and `stops`."""
     run = 0
     inside = False
-    for a in range(0, x.size, _LOOK):
-        part = x[a : a + _LOOK]
-        if inside and np.isfinite(_sum(part, 0.0)):
+    for a in range(0, x.size, _STRIP):
+        b = min(a + _STRIP, x.size)
+        finite = 0
+        for i in range(np.uint64(a), np.uint64(b)):
+            finite += np.isfinite(x[i])
+        if finite == (b - a if inside else 0):
             continue
-        for i in range(part.size):
-            if np.isfinite(part[i]) == inside:
+        for i in range(a, b):
+            if np.isfinite(x[i]) == inside:
                 continue
-            if inside:
-                stops[run] = a + i
-                run += 1
-            else:
-                if run == starts.size:
-                    starts = np.concatenate((starts, np.empty_like(starts)))
-                    stops = np.concatenate((stops, np.empty_like(stops)))
-                starts[run] = a + i
+            if run < starts.size:
+                if inside:
+                    stops[run] = i
+                else:
+                    starts[run] = i
+            run += inside
             inside = not inside
     if inside:
-        stops[run] = x.size
+        if run < starts.size:
+            stops[run] = x.size
         run += 1
-    return starts[:run], stops[:run]
+    return run
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
+def present_runs(x):  # type: ignore[no-untyped-def]
+    """First and one-past-last index of every run of finite samples: two int64 arrays."""
+    runs = np.empty((2, x.size // 256 + 16), np.int64)
+    count = _edges(x, runs[0], runs[1])
+    if count > runs.shape[1]:
+        runs = np.empty((2, count), np.int64)
+        _edges(x, runs[0], runs[1])
+    return runs[0, :count], runs[1, :count]
+
+
+@njit(**INNER)
 def _integrate_run(x, offset, total, theta):  # type: ignore[no-untyped-def]
     """``theta[i] = total + sum(x[: i + 1] - offset)`` of an unbroken run; returns the last."""
     # Four at a time: one addition instead of four in the chain from sample to sample.
@@ -128,7 +145,7 @@ def _integrate_run(x, offset, total, theta):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _largest(theta):  # type: ignore[no-untyped-def]
     """Largest magnitude; doubles without their sign are ordered as the integers of the same bits, which compare faster."""
     bits = theta.view(np.int64)
@@ -138,7 +155,7 @@ def _largest(theta):  # type: ignore[no-untyped-def]
     return largest.view(np.float64)[0]
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def thin_pyramid(flat, n_points, levels, a, b):  # type: ignore[no-untyped-def]
     """Carry the points ``a <= m < b`` of ``flat[:n_points]`` to the levels behind it, each every second point of the one before."""
     place = 0
@@ -153,7 +170,7 @@ def thin_pyramid(flat, n_points, levels, a, b):  # type: ignore[no-untyped-def]
         size = (size + 1) // 2
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def integrate(x, offset, starts, stops, flat, levels):  # type: ignore[no-untyped-def]
     """Angle ``theta[m] = sum(x[:m] - offset)`` over the runs of present samples, gaps adding nothing, and its thinned levels.
 
@@ -164,7 +181,7 @@ def integrate(x, offset, starts, stops, flat, levels):  # type: ignore[no-untype
     total = 0.0
     largest = 0.0
     run = 0
-    thin_pyramid(flat, theta.size, levels, 0, 1)
+    thin_pyramid(flat, theta.size, levels, np.int64(0), np.int64(1))
     for a in range(0, x.size, _TILE):
         b = min(a + _TILE, x.size)
         m = a
@@ -183,7 +200,7 @@ def integrate(x, offset, starts, stops, flat, levels):  # type: ignore[no-untype
     return largest
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyped-def]
     """The same integral as a sum of two doubles, to about 32 digits (two-sum of Knuth): values and remainders."""
     total = 0.0
@@ -207,22 +224,18 @@ def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyp
     low[done + 1 :] = rest
 
 
-@njit(nogil=True, cache=True)
-def needs_two_doubles(largest, x):  # type: ignore[no-untyped-def]
+def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:
     """Whether an angle as large as `largest` is too large against the sample-to-sample noise of `x` for doubles to keep the digits."""
     stride = max(1, x.size // 1000)
-    steps = np.empty(x.size // stride + 1)
-    count = 0
-    for i in range(0, x.size - 1, stride):
-        change = abs(float(x[i + 1]) - float(x[i]))
-        if np.isfinite(change):
-            steps[count] = change
-            count += 1
-    return count > 0 and largest > 1e4 * np.median(steps[:count])
+    before = x[: x.size - 1 : stride].astype(np.float64)
+    after = x[1::stride][: before.size].astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        change = np.abs(after - before)
+    change = change[np.isfinite(change)]
+    return bool(change.size > 0 and largest > 1e4 * np.median(change))
 
 
-@njit(nogil=True, cache=True)
-def pyramid_places(n_points, ks, shifts):  # type: ignore[no-untyped-def]
+def pyramid_places(n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
     """Where ``theta[:: 2**shift]`` of every shift (not falling) begins in one array, and the size of that array.
 
     Behind the angles there is room for what `gyrostab.kernels.vectors.split_sums` reads and ignores: it goes as far with
@@ -241,4 +254,4 @@ def pyramid_places(n_points, ks, shifts):  # type: ignore[no-untyped-def]
             size = (size + 1) // 2
             shift += 1
         begin[i] = place
-    return begin, place + size + 2 * apart + LANES
+    return begin, int(place + size + 2 * apart + LANES)

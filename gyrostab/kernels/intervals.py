@@ -8,13 +8,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.compiled import INNER, KERNEL
+
 __all__ = ["single_blocks", "valid_intervals"]
 
 # Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _valid_rate(starts, stops, k):  # type: ignore[no-untyped-def]
     """Intervals of m whose 2k samples are all present; a run of samples [s, e) has the angles s..e."""
     keep = 0
@@ -28,7 +30,7 @@ def _valid_rate(starts, stops, k):  # type: ignore[no-untyped-def]
     return begin[:keep], end[:keep]
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _valid_angle(starts, stops, k):  # type: ignore[no-untyped-def]
     """Intervals of m whose three angles m, m + k, m + 2k are all present (the paper's test)."""
     begin = np.empty(3 * starts.size + 1, np.int64)
@@ -53,7 +55,7 @@ def _valid_angle(starts, stops, k):  # type: ignore[no-untyped-def]
     return begin[:keep], end[:keep]
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def valid_intervals(starts, stops, k, angle):  # type: ignore[no-untyped-def]
     """Intervals [begin, end) of m of the valid second differences, from the runs of present samples (or angles)."""
     if angle:
@@ -61,7 +63,7 @@ def valid_intervals(starts, stops, k, angle):  # type: ignore[no-untyped-def]
     return _valid_rate(starts, stops, k)
 
 
-@njit(nogil=True, cache=True, fastmath=_FAST)
+@njit(fastmath=_FAST, **INNER)
 def _energy(theta, a, b, k):  # type: ignore[no-untyped-def]
     """Sum of squared second differences over ``a <= m < b``."""
     # Three slices: with theta[m + k] the signed index costs a wraparound test that blocks vectorisation.
@@ -75,7 +77,7 @@ def _energy(theta, a, b, k):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
     """Second differences of an angle held as two doubles; no reassociation, the large parts cancel exactly or nearly so."""
     h0, h1, h2 = high[a:b], high[a + k : b + k], high[a + 2 * k : b + 2 * k]
@@ -84,7 +86,7 @@ def _differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
         out[i] = ((h2[i] - h1[i]) - (h1[i] - h0[i])) + ((l2[i] - l1[i]) - (l1[i] - l0[i]))
 
 
-@njit(nogil=True, cache=True, fastmath=_FAST)
+@njit(fastmath=_FAST, **INNER)
 def _square(values):  # type: ignore[no-untyped-def]
     """Sum of squares."""
     total = 0.0
@@ -93,7 +95,7 @@ def _square(values):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _energy_two(high, low, a, b, k):  # type: ignore[no-untyped-def]
     """`_energy` for an angle held as two doubles."""
     buffer = np.empty(min(b - a, 2048))
@@ -105,7 +107,7 @@ def _energy_two(high, low, a, b, k):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: ignore[no-untyped-def]
     """Add the valid terms in ``a <= m < b`` to `sums` and `counts`; interval number `near` is the first that ends after a."""
     up = (1 << shift) - 1
@@ -122,10 +124,10 @@ def _part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: i
                 sums[0] += _energy(high, first, last, k >> shift)
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def single_blocks(high, low, places, starts, stops, angle, step, ks, shifts, head_lengths, whole, n_windows):  # type: ignore[no-untyped-def]
     """Heads and tails as `gyrostab.kernels.blocks.grouped_blocks`; `low` is the remainder of `high`, or empty."""
-    n_blocks = n_windows + whole.max()
+    n_blocks = n_windows + whole[0]
     heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     head_counts, tail_counts = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     for i in range(ks.size):

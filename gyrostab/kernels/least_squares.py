@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.mixture import (
     DATA,
     LANES,
@@ -29,7 +30,7 @@ __all__ = ["FIT_FIELDS", "fit_windows", "identify_noise"]
 FIT_FIELDS = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square", "separation")
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _quick(system, weight, factor, normal, right, allowed, squares):  # type: ignore[no-untyped-def]
     """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise."""
     normal[:] = 0.0
@@ -43,10 +44,10 @@ def _quick(system, weight, factor, normal, right, allowed, squares):  # type: ig
             right[a] += w * system[i, a] * y
             for b in range(5):
                 normal[a, b] += w * system[i, a] * system[i, b]
-    return solve_nonnegative(normal, right, allowed, squares)
+    return solve_nonnegative(normal, right, allowed, squares, np.int64(0))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**KERNEL)
 def identify_noise(avar, white, quantization, factor, columns, weight, to_samples, pairs, ramps):  # type: ignore[no-untyped-def]
     """Degrees of freedom of each cell with the noise mixture identified by a quick fit of the window.
 
@@ -81,7 +82,7 @@ def identify_noise(avar, white, quantization, factor, columns, weight, to_sample
     normal, right = np.empty((5, 5)), np.empty(5)
     for w in range(avar.shape[0]):
         if observe(avar[w], white[w], quantization[w], factor[w], columns, to_samples, system, seen, inverse):
-            _quick(system, weight, factor[w], normal, right, 31, squares)
+            _quick(system, weight, factor[w], normal, right, np.int64(31), squares)
             degrees_of_freedom(squares, avar[w], white[w], quantization[w], factor[w], columns, to_samples, diagonal, out[w])
             for i in range(n_tau):
                 if system[i, DATA] == 0.0:
@@ -89,7 +90,7 @@ def identify_noise(avar, white, quantization, factor, columns, weight, to_sample
     return out
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _without(a, squares, system, first, last, trial):  # type: ignore[no-untyped-def]
     """The noise if term `a` were not there and the neighbour most like it had made the same Allan variance instead.
 
@@ -108,7 +109,7 @@ def _without(a, squares, system, first, last, trial):  # type: ignore[no-untyped
         trial[stand_in] += squares[a] * system[cell, a] / system[cell, stand_in]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _growth(a, squares, system, seen, inverse, tables, root, weights, part, trial, result):  # type: ignore[no-untyped-def]
     """Variance of the estimate of term `a` as a polynomial in its square: rows 3, 4 and 5 of `result`."""
     first, last = 0, seen.shape[1] - 1
@@ -118,7 +119,10 @@ def _growth(a, squares, system, seen, inverse, tables, root, weights, part, tria
         last -= 1
     _without(a, squares, system, first, last, trial)
     parts = np.empty(3)
-    if a > 1 or (a == 1 and trial[0] == 0.0) or seen[2].max() == 0.0:
+    excess = 0.0
+    for i in range(seen.shape[1]):
+        excess = max(excess, seen[2, i])
+    if a > 1 or (a == 1 and trial[0] == 0.0) or excess == 0.0:
         trial[a] = 1.0
         root_squares(trial, seen, root)
         variance_parts(root, a, inverse, tables, weights, part, parts)
@@ -127,21 +131,21 @@ def _growth(a, squares, system, seen, inverse, tables, root, weights, part, tria
         return
     # quantization noise that counts as white (see observe) makes the terms one; the growth is that of the first unit
     root_squares(trial, seen, root)
-    variance_parts(root, -1, inverse, tables, weights, part, parts)
+    variance_parts(root, np.int64(-1), inverse, tables, weights, part, parts)
     result[3, a] = parts[0]
     trial[a] = 1.0
     root_squares(trial, seen, root)
-    variance_parts(root, -1, inverse, tables, weights, part, parts)
+    variance_parts(root, np.int64(-1), inverse, tables, weights, part, parts)
     both = parts[0]
     for b in range(5):
         trial[b] = 1.0 if a == b else 0.0
     root_squares(trial, seen, root)
-    variance_parts(root, -1, inverse, tables, weights, part, parts)
+    variance_parts(root, np.int64(-1), inverse, tables, weights, part, parts)
     result[5, a] = parts[0]
     result[4, a] = both - result[3, a] - parts[0]
 
 
-@njit(nogil=True, cache=True, fastmath=REORDER, error_model="numpy")
+@njit(fastmath=REORDER, **INNER)
 def _normal_equations(system, normal, right):  # type: ignore[no-untyped-def]
     """Normal matrix and right-hand side from whitened columns and data."""
     normal[:] = 0.0
@@ -153,7 +157,7 @@ def _normal_equations(system, normal, right):  # type: ignore[no-untyped-def]
                 normal[a, b] += system[i, a] * system[i, b]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _whiten(root, inverse, tables, system, whole, whitened):  # type: ignore[no-untyped-def]
     """Whitened columns and data; False when the covariance is hopeless. `whole` keeps the factor of the covariance."""
     n = root.shape[1]
@@ -176,7 +180,7 @@ def _whiten(root, inverse, tables, system, whole, whitened):  # type: ignore[no-
     return False
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _estimate(a, chosen, allowed, normal, right, squares, row, work, members, result):  # type: ignore[no-untyped-def]
     """Estimate of one term, free of sign beside the chosen ones; its weights on the right-hand sides to `row`.
 
@@ -204,7 +208,7 @@ def _estimate(a, chosen, allowed, normal, right, squares, row, work, members, re
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _iterate(system, seen, inverse, tables, allowed, chosen, squares, root, whole, whitened, normal, right):  # type: ignore[no-untyped-def]
     """Refit `squares` until the covariance is that of the fitted noise; returns the terms above zero, -1 where it is hopeless."""
     previous = np.empty(5)
@@ -224,7 +228,7 @@ def _iterate(system, seen, inverse, tables, allowed, chosen, squares, root, whol
     return chosen
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _judge(chosen, allowed, squares, system, seen, inverse, tables, root, whole, whitened, normal, right, work, result):  # type: ignore[no-untyped-def]
     """Estimates of all terms with their errors, separations and growing variances; returns chi-square."""
     n = seen.shape[1]
@@ -247,7 +251,7 @@ def _judge(chosen, allowed, squares, system, seen, inverse, tables, root, whole,
     return chi2
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**KERNEL)
 def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pairs, ramps, weight, allowed):  # type: ignore[no-untyped-def]
     """Fit every window.
 
@@ -283,7 +287,8 @@ def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pair
     combine_products(pairs, ramps, tables)
     diagonal = np.empty((n_tau, PRODUCTS))
     for i in range(n_tau):
-        diagonal[i] = tables[i, :, i]
+        for table in range(PRODUCTS):
+            diagonal[i, table] = tables[i, table, i]
     result = np.full((n_windows, len(FIT_FIELDS), 5), np.nan)
     misfit = np.full((n_windows, 2), np.nan)
     dof = np.full((n_windows, n_tau), np.nan)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.compiled import INNER, KERNEL
+
 __all__ = ["cell_limits", "interpolate_quantile"]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
     """Quantile of chi-square over its degrees of freedom, by Lagrange's cubic through four nodes of ``nu ln q``."""
     if not freedom > 0.0:
@@ -25,7 +27,7 @@ def _quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
     return np.exp(value / freedom)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**KERNEL)
 def interpolate_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
     """Quantile of chi-square over its degrees of freedom.
 
@@ -45,7 +47,7 @@ def interpolate_quantile(freedom, start, step, curve):  # type: ignore[no-untype
     return out
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _see(columns, white, quantization, squares, seen):  # type: ignore[no-untyped-def]
     """Allan variance of one cell under the fitted model; per squared coefficient, seen through the gaps, to `seen`."""
     model = 0.0
@@ -56,7 +58,7 @@ def _see(columns, white, quantization, squares, seen):  # type: ignore[no-untype
     return model
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**KERNEL)
 def cell_limits(avar, white, quantization, factor, squares, dof, columns, own_dof, most, start, step, curve):  # type: ignore[no-untyped-def]
     """Upper limit of each squared coefficient from one cell, which cannot be less than the term's own part of it.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.compiled import INNER
 from gyrostab.kernels.nonnegative import REORDER
 
 __all__ = [
@@ -32,7 +33,7 @@ PRODUCTS = 14
 DATA = 5
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def combine_products(pairs, ramps, tables):  # type: ignore[no-untyped-def]
     """Rows of the products of terms on and above the diagonal, both orders of a pair added, to `tables` (n, `PRODUCTS`, n)."""
     for i in range(pairs.shape[2]):
@@ -44,7 +45,7 @@ def combine_products(pairs, ramps, tables):  # type: ignore[no-untyped-def]
                     table += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def observe(avar, white, quantization, factor, columns, to_samples, system, seen, inverse):  # type: ignore[no-untyped-def]
     """Describe the cells of a window; returns how many are valid.
 
@@ -75,7 +76,7 @@ def observe(avar, white, quantization, factor, columns, to_samples, system, seen
     return n
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def root_squares(squares, seen, root):  # type: ignore[no-untyped-def]
     """Square roots of the squared coefficients in sample units, term by term and cell by cell."""
     for i in range(root.shape[1]):
@@ -86,7 +87,7 @@ def root_squares(squares, seen, root):  # type: ignore[no-untyped-def]
         root[4, i] = np.sqrt(squares[4] * seen[5, i])
 
 
-@njit(nogil=True, cache=True, fastmath=REORDER, error_model="numpy")
+@njit(fastmath=REORDER, **INNER)
 def covariance_rows(root, inverse, tables, out):  # type: ignore[no-untyped-def]
     """Covariance of the cells, on and above the diagonal of `out`."""
     n = root.shape[1]
@@ -104,7 +105,7 @@ def covariance_rows(root, inverse, tables, out):  # type: ignore[no-untyped-def]
             row[j] = total * min(share, inverse[j])  # the poorer cell uses a part of what the richer one uses
 
 
-@njit(nogil=True, cache=True, fastmath=REORDER, error_model="numpy")
+@njit(fastmath=REORDER, **INNER)
 def variance_parts(root, term, inverse, tables, weights, part, out):  # type: ignore[no-untyped-def]
     """Variance of the cells added with `weights`, their covariance as in `covariance_rows`; `part` is scratch.
 
@@ -133,7 +134,7 @@ def variance_parts(root, term, inverse, tables, weights, part, out):  # type: ig
             out[(a == term) + (b == term)] += total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def degrees_of_freedom(squares, avar, white, quantization, factor, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
     """Equivalent degrees of freedom of each finite cell under a mixture of noises, ``2 mean^2 / variance``."""
     amounts = np.empty(5)

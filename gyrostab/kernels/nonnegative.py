@@ -8,13 +8,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.compiled import INNER, KERNEL
+
 __all__ = ["back_substitute", "eliminate", "solve_nonnegative", "solve_subset"]
 
 #: Lets the compiler add in another order, which it needs for vector code; the order is the same on every call.
 REORDER = {"reassoc", "contract", "nsz"}
 
 
-@njit(nogil=True, cache=True, fastmath=REORDER, error_model="numpy")
+@njit(fastmath=REORDER, **INNER)
 def eliminate(system):  # type: ignore[no-untyped-def]
     """Replace ``[C | Y]`` by ``[U | U^-T Y]`` where ``C = U^T U``; False when C is not positive definite.
 
@@ -47,7 +49,7 @@ def eliminate(system):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(nogil=True, cache=True, fastmath=REORDER, error_model="numpy")
+@njit(fastmath=REORDER, **INNER)
 def back_substitute(system, vector):  # type: ignore[no-untyped-def]
     """Solve ``U x = vector`` in place, U the upper triangle that `eliminate` left."""
     n = vector.size
@@ -60,7 +62,7 @@ def back_substitute(system, vector):  # type: ignore[no-untyped-def]
         vector[i] = (vector[i] - total) / row[i]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _list_members(subset, members):  # type: ignore[no-untyped-def]
     n = 0
     for i in range(members.size):
@@ -70,7 +72,7 @@ def _list_members(subset, members):  # type: ignore[no-untyped-def]
     return n
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def solve_subset(normal, right, subset, solution, work, members):  # type: ignore[no-untyped-def]
     """Solve the normal equations for the terms in the bit set `subset`; False when they cannot be told apart.
 
@@ -109,7 +111,7 @@ def solve_subset(normal, right, subset, solution, work, members):  # type: ignor
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(**INNER)
 def _optimal(normal, right, allowed, subset, solution):  # type: ignore[no-untyped-def]
     """Whether the solution for `subset` is not negative, and no other allowed term would improve it (Karush-Kuhn-Tucker)."""
     for i in range(right.size):
@@ -125,8 +127,8 @@ def _optimal(normal, right, allowed, subset, solution):  # type: ignore[no-untyp
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def solve_nonnegative(normal, right, allowed, solution, guess=0):  # type: ignore[no-untyped-def]
+@njit(**KERNEL)
+def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[no-untyped-def]
     """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``; returns the bit set of the terms above zero.
 
     Parameters
@@ -138,7 +140,7 @@ def solve_nonnegative(normal, right, allowed, solution, guess=0):  # type: ignor
     solution : float64 (n,)
         Overwritten with the minimiser.
     guess : int
-        Bit set that is tried first; if it holds the minimiser, no other is tried.
+        Bit set that is tried first; if it holds the minimiser, no other is tried. None where it is 0.
     """
     n = right.size
     room, members = np.empty((2 * n + 3, n)), np.empty(n, np.int64)

@@ -10,10 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.compiled import INNER, KERNEL
+
 __all__ = ["strict_gap_factors", "white_pair_sum"]
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _moment(n, slope, a, b):  # type: ignore[no-untyped-def]
     """``sum((n - l) (1 - slope l)^2 for l in a..b)`` in closed form."""
     if b < a:
@@ -26,17 +28,17 @@ def _moment(n, slope, a, b):  # type: ignore[no-untyped-def]
     return n * s0 - (1 + 2 * slope * n) * s1 + (2 * slope + slope**2 * n) * s2 - slope**2 * s3
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def white_pair_sum(n, k):  # type: ignore[no-untyped-def]
     """``sum_ij rho(i - j)^2`` over n consecutive second differences of averaging factor k, for angle random walk."""
     if n < 1:
         return 0.0
-    near = _moment(float(n), 1.5 / k, 1, min(n - 1, k))
+    near = _moment(float(n), 1.5 / k, np.int64(1), min(n - 1, k))
     far = _moment(float(n), 0.5 / k, k + 1, min(n - 1, 2 * k - 1))
     return n + 2.0 * (near + far)
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def strict_gap_factors(begin, end, counts, full, k, shift, window, step):  # type: ignore[no-untyped-def]
     """Degrees of freedom of each window with gaps, as a share of the gap-free window's.
 
@@ -75,5 +77,5 @@ def strict_gap_factors(begin, end, counts, full, k, shift, window, step):  # typ
             b = (min(end[u], first + length) + up) >> shift
             pairs += white_pair_sum(b - a, k >> shift)
         ratio = counts[j] / full[j]
-        out[j] = ratio * ratio * white_pair_sum(full[j], k >> shift) / pairs
+        out[j] = ratio * ratio * white_pair_sum(int(full[j]), k >> shift) / pairs
     return out

@@ -16,6 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gyrostab.kernels.compiled import INNER, KERNEL
+
 __all__ = ["direct_sums", "recursive_sums", "reference_theta"]
 
 
@@ -76,7 +78,7 @@ def direct_sums(
     return sums, counts
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _difference(theta, present, missing, m, k):  # type: ignore[no-untyped-def]
     """Second difference at m, zero where a point is missing (Eq. 21-22), and whether it is there."""
     if present[m] and present[m + k] and present[m + 2 * k] and missing[m] == missing[m + 2 * k]:
@@ -84,7 +86,7 @@ def _difference(theta, present, missing, m, k):  # type: ignore[no-untyped-def]
     return 0.0, 0
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def recursive_sums(theta, present, missing, window_points, step, n_windows, ks):  # type: ignore[no-untyped-def]
     """Fast DAVAR (Eq. 19): sample by sample, the newest squared difference in, the oldest out.
 

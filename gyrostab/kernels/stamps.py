@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import INNER, KERNEL
 
 __all__ = [
     "DUPLICATE",
@@ -24,6 +27,8 @@ __all__ = [
     "place",
     "track",
 ]
+
+Integers = NDArray[np.int64]
 
 #: Value of a stamp that could not be read (numpy's NaT as an integer).
 NO_STAMP = np.iinfo(np.int64).min
@@ -49,7 +54,7 @@ def new_state() -> tuple[np.ndarray, np.ndarray]:
     return np.zeros(13, dtype=np.int64), np.zeros(_RING, dtype=np.bool_)
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
     """Count the samples between stamps that lie near a lattice of `period`.
 
@@ -91,7 +96,7 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
     return count, piece
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _fits(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
     """Whether the next readable stamps after row j lie where unbroken counting puts them, after `expected`."""
     found = 0
@@ -108,7 +113,7 @@ def _fits(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _persists(stamps, j, n, latest):  # type: ignore[no-untyped-def]
     """Whether the stamps after row j stay behind the latest one, so that the clock was set back."""
     found = 0
@@ -123,7 +128,7 @@ def _persists(stamps, j, n, latest):  # type: ignore[no-untyped-def]
     return found > 1
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _origin(stamps, j, period):  # type: ignore[no-untyped-def]
     """Stamp [ns] that sample j should have had, as the stamps after it tell: its own jitter must not shift all others."""
     total, found = 0.0, 0
@@ -137,7 +142,7 @@ def _origin(stamps, j, period):  # type: ignore[no-untyped-def]
     return stamps[j] + np.int64(np.rint(total / found * period))
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _occupy(ring, head, sample):  # type: ignore[no-untyped-def]
     """Mark `sample`, past the head, as taken and all between as free."""
     for g in range(max(head + 1, sample - len(ring) + 1), sample):
@@ -145,14 +150,14 @@ def _occupy(ring, head, sample):  # type: ignore[no-untyped-def]
     ring[sample % len(ring)] = True
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _is_free(ring, state, target):  # type: ignore[no-untyped-def]
     """Whether a sample before the head, of the same piece and not too long ago, has no row yet."""
     lowest = max(state[_GRID0], state[_HEAD] - len(ring) + 1)
     return lowest <= target <= state[_HEAD] and not ring[target % len(ring)]
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _settle(row, position, state, ring):  # type: ignore[no-untyped-def]
     """Place the rows without a stamp that come just before `row`, if it leaves exactly their room."""
     pending = state[_PENDING]
@@ -165,7 +170,7 @@ def _settle(row, position, state, ring):  # type: ignore[no-untyped-def]
         state[_HEAD] += pending
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _ahead(stamps, j, position, period, max_gap, state):  # type: ignore[no-untyped-def]
     """Judge row j, whose stamp is later than the next sample: verdict and sample."""
     expected = state[_HEAD] + 1
@@ -179,7 +184,7 @@ def _ahead(stamps, j, position, period, max_gap, state):  # type: ignore[no-unty
     return _ON_TIME, np.int64(np.rint(position))
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _behind(stamps, j, position, period, state, ring):  # type: ignore[no-untyped-def]
     """Judge row j, whose stamp is earlier than the next sample: verdict and sample."""
     expected = state[_HEAD] + 1
@@ -196,7 +201,7 @@ def _behind(stamps, j, position, period, state, ring):  # type: ignore[no-untype
     return DUPLICATE if target >= state[_HEAD] else OUT_OF_ORDER, max(target, state[_GRID0])
 
 
-@njit(nogil=True, cache=True)
+@njit(**INNER)
 def _judge(stamps, j, position, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
     """Judge row j, whose stamp lies at `position` on the grid: verdict and sample."""
     expected = state[_HEAD] + 1
@@ -215,8 +220,65 @@ def _judge(stamps, j, position, period, hold, max_gap, state, ring):  # type: ig
     return _ON_TIME, expected
 
 
-@njit(nogil=True, cache=True)
-def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
+@njit(**INNER)
+def _add_run(runs, n, sample, row, length):  # type: ignore[no-untyped-def]
+    runs[n, 0], runs[n, 1], runs[n, 2] = sample, row, length
+    return n + 1
+
+
+@njit(**INNER)
+def _note(events, n, cause, sample, row, before, stamp):  # type: ignore[no-untyped-def]
+    events[n, 0], events[n, 1], events[n, 2], events[n, 3], events[n, 4] = cause, sample, row, before, stamp
+    return n + 1
+
+
+@njit(**KERNEL)
+def _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  # type: ignore[no-untyped-def]
+    """`place` into `runs` and `events`; returns how many there are of each."""
+    n_runs, n_events = np.int64(0), np.int64(0)
+    for j in range(n):
+        row, stamp = rows[j], stamps[j]
+        if stamp == NO_STAMP:
+            if state[STARTED] and (state[_ROW] + 1 + state[_PENDING] == row):
+                state[_PENDING] += 1
+            continue
+        if not state[STARTED]:
+            state[STARTED] = 1
+            state[FIRST] = state[_LATEST] = stamp
+            state[_STAMP0] = _origin(stamps, j, period)
+            state[_ROW] = state[_RUN_ROW] = row
+            state[_RUN_LENGTH] = 1
+            ring[0] = True
+            continue
+        position = state[_GRID0] - state[_PHASE] * _UNIT + (stamp - state[_STAMP0]) / period
+        _settle(row, position, state, ring)
+        head = state[_HEAD]
+        verdict, target = _judge(stamps, j, position, period, hold, max_gap, state, ring)
+        if verdict > _BY_COUNT:
+            n_events = _note(events, n_events, verdict, head + 1 if verdict >= STEP else target, row, state[_LATEST], stamp)
+        if verdict >= STEP:
+            state[_GRID0], state[_STAMP0], state[_LATEST], state[_PHASE] = target, _origin(stamps, j, period), stamp, 0
+        elif verdict == OUT_OF_ORDER and _is_free(ring, state, target):
+            ring[target % len(ring)] = True
+            n_runs = _add_run(runs, n_runs, target, row, np.int64(1))
+            continue
+        elif verdict > _BY_COUNT:
+            continue
+        if target == head + 1 and row == state[_ROW] + 1:
+            state[_RUN_LENGTH] += 1
+        else:
+            n_runs = _add_run(runs, n_runs, state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH])
+            state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH] = target, row, 1
+        _occupy(ring, head, target)
+        state[_HEAD], state[_ROW] = target, row
+        if verdict != _BY_COUNT:
+            state[_LATEST] = max(state[_LATEST], stamp)
+    return n_runs, n_events
+
+
+def place(
+    rows: Integers, stamps: Integers, n: int, period: float, hold: float, max_gap: float, state: Integers, ring: NDArray[np.bool_]
+) -> tuple[Integers, Integers]:
     """Give rows their samples.
 
     The next row takes the next sample while its stamp is within half a sample of it; otherwise the sample is found anew
@@ -246,47 +308,6 @@ def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[
     events : ndarray of int64, shape (n_events, 5)
         Cause, sample, row, stamp before [ns], stamp [ns].
     """
-    runs = np.empty((2 * n + 2, 3), dtype=np.int64)
-    events = np.empty((2 * n + 2, 5), dtype=np.int64)
-    n_runs = n_events = 0
-    for j in range(n):
-        row, stamp = rows[j], stamps[j]
-        if stamp == NO_STAMP:
-            if state[STARTED] and (state[_ROW] + 1 + state[_PENDING] == row):
-                state[_PENDING] += 1
-            continue
-        if not state[STARTED]:
-            state[STARTED] = 1
-            state[FIRST] = state[_LATEST] = stamp
-            state[_STAMP0] = _origin(stamps, j, period)
-            state[_ROW] = state[_RUN_ROW] = row
-            state[_RUN_LENGTH] = 1
-            ring[0] = True
-            continue
-        position = state[_GRID0] - state[_PHASE] * _UNIT + (stamp - state[_STAMP0]) / period
-        _settle(row, position, state, ring)
-        head = state[_HEAD]
-        verdict, target = _judge(stamps, j, position, period, hold, max_gap, state, ring)
-        if verdict > _BY_COUNT:
-            events[n_events] = (verdict, head + 1 if verdict >= STEP else target, row, state[_LATEST], stamp)
-            n_events += 1
-        if verdict >= STEP:
-            state[_GRID0], state[_STAMP0], state[_LATEST], state[_PHASE] = target, _origin(stamps, j, period), stamp, 0
-        elif verdict == OUT_OF_ORDER and _is_free(ring, state, target):
-            ring[target % len(ring)] = True
-            runs[n_runs] = (target, row, 1)
-            n_runs += 1
-            continue
-        elif verdict > _BY_COUNT:
-            continue
-        if target == head + 1 and row == state[_ROW] + 1:
-            state[_RUN_LENGTH] += 1
-        else:
-            runs[n_runs] = (state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH])
-            n_runs += 1
-            state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH] = target, row, 1
-        _occupy(ring, head, target)
-        state[_HEAD], state[_ROW] = target, row
-        if verdict != _BY_COUNT:
-            state[_LATEST] = max(state[_LATEST], stamp)
+    runs, events = np.empty((2 * n + 2, 3), dtype=np.int64), np.empty((2 * n + 2, 5), dtype=np.int64)
+    n_runs, n_events = _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events)
     return runs[:n_runs].copy(), events[:n_events].copy()

@@ -13,6 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gyrostab.kernels.compiled import KERNEL
+
 __all__ = [
     "brownian_means",
     "flicker_means",
@@ -66,7 +68,7 @@ def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, flo
     return end - steps / 2.0 + inner / math.sqrt(12.0), last
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL)
 def ornstein_uhlenbeck(normal: Array, decay: Array, weight: Array, rest: float, position: Array) -> tuple[Array, Array]:
     """Sum of the means over every sample of Ornstein-Uhlenbeck processes of unit variance.
 

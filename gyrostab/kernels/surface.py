@@ -8,8 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.blocks import full_counts, grouped_blocks, windows_from_blocks
+from gyrostab.kernels.blocks import full_counts, grouped_blocks, groups, windows_from_blocks
 from gyrostab.kernels.clusters import cluster_cell, cluster_prefix
+from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.integrate import (
     block_sums,
     first_present,
@@ -66,7 +67,7 @@ class Unit(NamedTuple):
     min_coverage: float
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def _fill(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[no-untyped-def]
     """Cells from sums of squares; `counts` is empty where nothing is missing."""
     for j in range(sums.shape[0]):
@@ -83,7 +84,7 @@ def _fill(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[n
             cells[6, j, i] = 1.0
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, cells):  # type: ignore[no-untyped-def]
     """Degrees of freedom of the strict cells, as a share of the gap-free ones."""
     for i in range(ks.size):
@@ -92,10 +93,12 @@ def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, ce
                 cells[3, j, i] = counts[j, i] / full[j, i]
             continue
         begin, end = valid_intervals(starts, stops, ks[i], angle)
-        cells[3, :, i] = strict_gap_factors(begin, end, counts[:, i], full[:, i], ks[i], shifts[i], window, step)
+        factors = strict_gap_factors(begin, end, counts[:, i], full[:, i], ks[i], shifts[i], window, step)
+        for j in range(factors.size):
+            cells[3, j, i] = factors[j]
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def _bridge_gaps(theta, starts, stops, window, step, ks, poor, cells):  # type: ignore[no-untyped-def]
     """Weighted clusters where too few terms are left (rate logs only)."""
     present, samples, runs = cluster_prefix(starts, stops, theta.size - 1)
@@ -159,8 +162,9 @@ def _strict_sums(angle: _Angle, unit: Unit, n_windows: int, gaps: bool) -> tuple
             angle.flat, angle.rest, angle.places, starts, stops, unit.angle, unit.step, unit.ks, unit.shifts, rest, whole, n_windows
         )
     else:
+        runs, order = (angle.starts, angle.stops), (unit.ks, unit.shifts, groups(unit.shifts))
         heads, tails, head_counts, tail_counts = grouped_blocks(
-            angle.flat, angle.places, angle.starts, angle.stops, unit.step, unit.ks, unit.shifts, rest, whole, n_windows, gaps
+            angle.flat, angle.places, *runs, unit.step, *order, rest, whole, n_windows, gaps
         )
     sums = windows_from_blocks(heads, tails, whole, n_windows)
     return sums, windows_from_blocks(head_counts, tail_counts, whole, n_windows) if gaps else np.empty((0, 0))

@@ -16,6 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gyrostab.kernels.compiled import KERNEL
+
 __all__ = ["mean_changes", "mean_play", "play", "relax", "slab"]
 
 Array = NDArray[np.float64]
@@ -60,7 +62,7 @@ def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
     return times, whole, halves
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL)
 def _relax(change: Array, decay: Array, gain: Array, weight: Array, carry: Array) -> tuple[Array, Array]:
     size, count = change.size, decay.size
     total = np.empty((weight.shape[0], size))
@@ -105,7 +107,7 @@ def relax(values: Array, rate: float, times: Array, weight: Array, carry: tuple[
     return total, (float(values[-1]), position)
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL)
 def _follow(at: Array, values: Array, time: float) -> Array:
     behind = 0.0
     out = np.empty(at.size)
@@ -160,7 +162,7 @@ def _joined(known: Array, values: Array, begin: Array, end: Array) -> tuple[Arra
     return at, line
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL)
 def play(values: Array, width: float, start: float) -> tuple[Array, float]:
     """Play of half-width `width`: a slider that is dragged along by `values` and stands while they move inside of its play.
 

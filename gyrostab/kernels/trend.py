@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.compiled import KERNEL
+
 __all__ = ["window_trend"]
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def window_trend(values, seconds, first, last):  # type: ignore[no-untyped-def]
     """Mean and least-squares slope over ``[first[j], last[j])`` for every window j, NaN left out.
 

@@ -16,6 +16,8 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from gyrostab.kernels.compiled import KERNEL
+
 __all__ = ["LANES", "TOGETHER", "split_sums"]
 
 #: Elements of a vector.
@@ -161,7 +163,7 @@ def _of_lags(count: int) -> Any:
 _one, _two, _three, _four = (_of_lags(count) for count in range(1, TOGETHER + 1))
 
 
-@njit(nogil=True, cache=True)
+@njit(**KERNEL)
 def split_sums(theta, first, count, lags, at, splits, sizes, out):  # type: ignore[no-untyped-def]
     """Sums of squared second differences of one to four lags from one place on, in two parts.
 
