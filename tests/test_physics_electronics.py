@@ -375,6 +375,8 @@ def test_what_has_a_memory_begins_as_if_it_had_been_there_long():
     assert first.std() == pytest.approx(2.0, rel=0.05)
     steady = run(make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=2.0)
     np.testing.assert_allclose(steady, 1.7, rtol=1e-12)
+    stuck = run(make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=0.25)
+    np.testing.assert_allclose(stuck, 0.0, atol=1e-15)
 
 
 # -------------------------------------------------------------------------------------------------- densities that are said
