@@ -22,7 +22,7 @@ from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
-from gyrostab.store import open_stored
+from gyrostab.store import open_stored, stored_attribute
 from gyrostab.timegrid import grid_times, time_coordinate
 from gyrostab.units import ON_DISK
 
@@ -115,13 +115,10 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
 
 def _is_own(path: Path) -> bool:
     """Whether it says that gyrostab wrote it as a log; what is damaged as a whole says nothing."""
-    import netCDF4
-
     try:
         if path.is_dir():
             return bool(json.loads((path / ".zattrs").read_text()).get("gyrostab_content") == "log")
-        with netCDF4.Dataset(path) as file:
-            return bool(getattr(file, "gyrostab_content", "") == "log")
+        return stored_attribute(path, "gyrostab_content") == "log"
     except (OSError, RuntimeError, ValueError, AttributeError):
         return False
 

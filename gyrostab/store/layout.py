@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.store.lock import library_lock
 
-__all__ = ["ChunkDamage", "is_readable", "read_chunk"]
+__all__ = ["ChunkDamage", "is_readable", "read_chunk", "stored_attribute"]
 
 #: Variables of files whose layout is remembered: some for each file of a long archive.
 _REMEMBERED = 2**12
@@ -48,6 +48,24 @@ class _ZarrLayout:
     dtype: np.dtype[Any]
     codecs: tuple[Any, ...]
     separator: str
+
+
+def stored_attribute(path: Path, name: str) -> str:
+    """Look up an attribute of a NetCDF file without opening all of it; empty when it has none, or is of an older format.
+
+    Raises
+    ------
+    OSError
+        When the file is damaged.
+    """
+    import h5py
+
+    with library_lock():
+        if not h5py.is_hdf5(path):
+            return ""
+        with h5py.File(path, "r") as file:
+            value = file.attrs.get(name, "")
+    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:

@@ -54,26 +54,27 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
         stored.close()
         raise FormatError(f"{path}: is {name}, but not one that gyrostab wrote; read it with gyrostab.read_log (gyrostab ingest)")
     is_log = stored.attrs.get("gyrostab_content") == "log"
-    opened = _lazy(_lazy_log(stored, path, strict=strict) if is_log else stored, small=_SMALL if is_log else 0)
+    long = _long_variables(stored, path, strict=strict) if is_log else {}
+    opened = _lazy(stored, long, small=_SMALL if is_log else 0)
     if is_log:
-        stored.close()  # opened again where needed; while a NetCDF file is open, its library keeps the chunks read through any other handle
+        stored.close()  # opened again where needed: no archive of any length holds more than a few files open
     return opened
 
 
-def _lazy(stored: xr.Dataset, *, small: int) -> xr.Dataset:
+def _lazy(stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int) -> xr.Dataset:
     """Load what is small, and make dask arrays, by the chunks on disk, of what is not one yet: making and reading one takes its time."""
-    close = stored._close
-    rest = {name: item.variable for name, item in stored.data_vars.items() if item.chunks is None}
+    rest = {name: item.variable for name, item in stored.data_vars.items() if name not in long}
     ready = {
         name: item.load() if item.size < small else item.chunk(item.encoding.get("preferred_chunks", {})) for name, item in rest.items()
     }
-    lazy = stored.assign(ready)
-    lazy.set_close(close)
+    lazy = xr.Dataset({name: long.get(name, ready.get(name)) for name in stored.data_vars}, stored.coords, stored.attrs)
+    lazy.encoding = stored.encoding
+    lazy.set_close(stored._close)
     return lazy
 
 
-def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
-    """Put arrays that know about damage in place of the long variables of a log."""
+def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
+    """The long variables of a log, as arrays that know about damage."""
     import dask.array as da
 
     labels = [str(label) for label in stored["axis"].values]
@@ -108,7 +109,7 @@ def _lazy_log(stored: xr.Dataset, path: Path, *, strict: bool) -> xr.Dataset:
         )
         packing = {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)} if array.scale is not None else {}
         long[name] = xr.Variable(variable.dims, lazy, variable.attrs, packing)
-    return stored.assign(long)
+    return long
 
 
 def _spans(stored: xr.Dataset, dim: str, length: int) -> dict[str, Any] | tuple[tuple[int, int], ...]:
