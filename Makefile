@@ -34,8 +34,11 @@ lint: $(VENV)/.installed-lint  ## style, types and imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.installed-test  ## time the kernels beside their peers
-	$(BIN)/python benchmarks/kernels.py
+bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.md anew: an hour of an idle machine
+	$(BIN)/python benchmarks/kernels.py --output docs/performance.md
+	$(BIN)/python benchmarks/fit.py --output docs/performance.md
+	$(BIN)/python benchmarks/end_to_end.py --output docs/performance.md
+	$(BIN)/python benchmarks/scaling.py --output docs/scaling.md
 
 real-recordings: $(VENV)/.installed  ## remake docs/real-recordings.md from the recordings, where they are present
 	$(BIN)/python pipelines/real_recordings.py

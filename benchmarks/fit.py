@@ -1,7 +1,7 @@
 """Time the fit of windows: the kernel, the limits, and what is made once for a surface.
 
-    python -m benchmarks.fit                       # a minute
-    python -m benchmarks.fit --output fit.md
+    python benchmarks/fit.py                                  # a minute
+    python benchmarks/fit.py --output docs/performance.md     # renew the part of the document between its marks
 
 Windows of 5 min at 400 Hz of quantization noise, angle and rate random walk; processor time of one thread, the best of several runs.
 """
@@ -9,12 +9,16 @@ Windows of 5 min at 400 Hz of quantization noise, angle and rate random walk; pr
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import dask
 import numpy as np
+from page import machine, renew
 
 from gyrostab import davar, fit, fit_noise, make_log
 from gyrostab.kernels.covariance import diagonal_products
@@ -62,7 +66,7 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, help="write the table to this file instead of the screen")
+    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     lines = [
@@ -76,11 +80,10 @@ def main() -> None:
                 size, (whole, kernel, limits, rest, quick, once) = measure(x, taus, arguments.repeats)
                 name = "10 % in blocks of 1000" if missing else "none"
                 lines.append(f"| {name} | {size} | {whole:.0f} | {kernel:.0f} | {limits:.1f} | {rest:.1f} | {quick:.1f} | {once:.2f} |")
-    text = "\n".join(lines) + "\n"
+    text = f"{machine()}; best of {arguments.repeats}.\n\n" + "\n".join(lines)
+    print(text)
     if arguments.output:
-        arguments.output.write_text(text)
-    else:
-        print(text, end="")
+        renew(arguments.output, "fit", text)
 
 
 if __name__ == "__main__":

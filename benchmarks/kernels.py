@@ -28,6 +28,7 @@ import allantools
 import dask
 import numba
 import numpy as np
+from page import renew
 
 from gyrostab import davar, make_log
 from gyrostab.kernels.surface import Unit, surface_unit
@@ -36,7 +37,6 @@ from gyrostab.windows import averaging_factors, thin
 
 RATE = 100.0
 SHAPES = {"x1": (6_000, 1000, 30), "x2": (600_000, 2000, 300), "vibration": (372_000, 2000, 1000)}
-MARKS = ("<!-- kernels: begin -->", "<!-- kernels: end -->")
 C_LOOP = """
 double energy(const double *t, long n, long k, long turns) {
     double total = 0;
@@ -210,9 +210,7 @@ def main() -> None:
         print(line, flush=True)
         lines.append(line)
     if arguments.output:
-        text = arguments.output.read_text()
-        before, rest = text.split(MARKS[0])
-        arguments.output.write_text(before + MARKS[0] + "\n" + "\n".join(lines) + "\n" + MARKS[1] + rest.split(MARKS[1])[1])
+        renew(arguments.output, "kernels", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from page import machine, renew
 
 RATE, AXES, COUNT = 400.0, 3, 0.02
 WINDOW = {"window": "10min", "step": "1min", "taus": "40"}
@@ -92,14 +91,6 @@ def table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join(["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *("| " + " | ".join(row) + " |" for row in rows)])
 
 
-def machine() -> str:
-    name = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        name = next((line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")), name)
-    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}, load {os.getloadavg()[0]:.1f} at the end"
-
-
 def against_length(folder: Path, given: argparse.Namespace, options: dict[str, object]) -> str:
     rows, times, bare = [], [], []
     empty = measure(write_store(folder / "empty.zarr", 0.2), WINDOW, options, given.rounds)
@@ -160,9 +151,7 @@ def main() -> None:
     text = "\n\n".join(parts)
     print(text)
     if given.output:
-        begin, end = "<!-- scaling: begin -->", "<!-- scaling: end -->"
-        page = given.output.read_text() if given.output.exists() else f"{begin}\n{end}\n"
-        given.output.write_text(f"{page.split(begin)[0]}{begin}\n{text}\n{end}{page.split(end)[1]}")
+        renew(given.output, "scaling", text)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Check every statistical claim of the fit by simulation and print the table of docs/statistics.md.
 
-    python -m benchmarks.statistics > docs/statistics-table.md      # about five minutes
+    python -m benchmarks.fit_statistics > docs/statistics-table.md      # about five minutes
 
 Each row is 1000 independent windows of 40 s at 100 Hz, simulated outside the package (tests/noise_records.py).
 """

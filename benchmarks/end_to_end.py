@@ -1,17 +1,16 @@
 """From files to product, against merely reading the files: NetCDF (int32, zstd), Zarr (int32, blosc) and CSV, with 1 and 2 workers.
 
-    python benchmarks/io.py --hours 12
+    python benchmarks/end_to_end.py --hours 12 --output docs/performance.md
 
-Prints a Markdown table. Every figure is the best of some runs, each in a process of its own that is warm: kernels compiled, files in
-the cache of the system. Reading is every sample as a double in memory, chunk by chunk, through dask (for CSV: a table of pyarrow).
+Prints a Markdown table, and puts it into its place in a page. Every figure is the best of some runs, each in a process of its own that
+is warm: kernels compiled, files in the cache of the system. Reading is every sample as a double in memory, chunk by chunk, through
+dask (for CSV: a table of pyarrow).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ import time
 from pathlib import Path
 
 import make_archive
+from page import machine, renew
 
 FORMATS = {"nc": "NetCDF, int32, zstd", "zarr": "Zarr, int32, blosc", "csv": "CSV"}
 TARGETS = {"nc": 2.0, "zarr": 2.0, "csv": 1.5}
@@ -33,6 +33,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS))
     parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
     parser.add_argument("--measure", nargs=3, metavar=("WHAT", "WORKERS", "FOLDER"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.measure:
@@ -42,11 +43,12 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as root:
         rows = [row for form in options.formats for row in compare(form, Path(root, form), options)]
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, {options.rate:g} Hz, 3 axes"
-    print(f"\n{machine}, files of one hour with gaps; best of {options.repeat}\n")
-    print("| archive | hours | workers | read [s] | Msamples/s | whole run [s] | Msamples/s | run / read | target |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    print(*rows, sep="\n")
+    head = "| archive | hours | workers | read [s] | Msamples/s | whole run [s] | Msamples/s | run / read | target |"
+    said = f"{machine()}; {options.rate:g} Hz, 3 axes, files of one hour with gaps; best of {options.repeat}."
+    text = "\n".join([f"{said}\n", head, "|---|---|---|---|---|---|---|---|---|", *rows])
+    print(text)
+    if options.output:
+        renew(options.output, "end to end", text)
 
 
 def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
