@@ -14,6 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gyrostab import export
+from gyrostab.cli import main
 from gyrostab.errors import FormatError, MissingUnitError, OptionError, TimeError, UnitError
 from gyrostab.gaps import gap_variables
 from gyrostab.join import join_logs
@@ -482,17 +483,55 @@ def test_each_file_is_told_as_it_is_read(archive: list[Path]) -> None:
     assert "on_file" not in log.attrs["history"]
 
 
-def test_the_command_line_goes_on_unless_strict(archive: list[Path], tmp_path: Path) -> None:
+def test_the_command_line_goes_on_unless_strict(archive: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     binary(archive[2])
-    command = [sys.executable, "-m", "gyrostab", "ingest", *map(str, archive), "--quiet-progress"]
-    done = subprocess.run([*command, "-o", str(tmp_path / "log.nc")], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "run_10.csv" in done.stderr
+    command = ["ingest", *map(str, archive), "--quiet-progress"]
+    assert main([*command, "-o", str(tmp_path / "log.nc")]) == 0
+    assert "run_10.csv" in capsys.readouterr().err
     with export.open_log(tmp_path / "log.nc") as log:
         assert log.attrs["unreadable_files"] == ["run_10.csv"]
         assert "unreadable" in set(gap_table(log)["cause"])
-    done = subprocess.run([*command, "-o", str(tmp_path / "second.nc"), "--strict"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "run_10.csv" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert main([*command, "-o", str(tmp_path / "second.nc"), "--strict"]) == 2
+    assert "run_10.csv" in capsys.readouterr().err
     assert not (tmp_path / "second.nc").exists()
+
+
+# --- memory ------------------------------------------------------------------------------------------------------
+
+READ_THROUGH = """
+import sys, warnings
+from pathlib import Path
+import dask
+from gyrostab.read import read_log
+
+def most():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+
+def through(files):
+    with warnings.catch_warnings(), dask.config.set(scheduler="threads", num_workers=2), read_log(files) as log:
+        warnings.simplefilter("ignore")
+        for begin in range(0, log.sizes["time"], 60_000):  # never whole chunks
+            log.rate[:, begin : begin + 60_000].values
+    return most()
+
+files = sys.argv[1:]
+few = through(files[:8])
+print(few, through(files))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells the peak of the memory this way")
+def test_memory_does_not_grow_with_the_number_of_files(tmp_path: Path) -> None:
+    """Each file has six chunks of 256 KiB, the last of each axis short, and shares some samples with the next."""
+    size, paths = 70_000, []
+    values = signal(size, holes=0)
+    values[:, -100:] = values[:, :100]
+    for place in range(24):
+        log = log_of(np.concatenate([values, values[:1]]), place * (size - 100), axes="xyz")
+        log["rate"].encoding = {"dtype": np.dtype("i4"), "scale_factor": 1.0}
+        paths.append(export.to_netcdf(log.load(), tmp_path / f"{place:02d}.nc"))
+    done = subprocess.run([sys.executable, "-c", READ_THROUGH, *map(str, paths)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    few, many = map(int, done.stdout.split())
+    assert (many - few) / 16 < 800, f"{few / 1024:.0f} MiB with 8 files, {many / 1024:.0f} MiB with 24"  # [KiB a file]
