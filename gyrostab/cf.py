@@ -202,7 +202,8 @@ def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, A
     times = dataset.get("time")
     if times is not None and times.dtype.kind == "M" and times.size:
         for end, position in (("start", 0), ("end", -1)):
-            given[f"time_coverage_{end}"] = f"{times[position].values.astype('datetime64[us]')}Z"
+            stamp = np.asarray(times[position].values).ravel()[0]  # one dimension where the axis is computed
+            given[f"time_coverage_{end}"] = f"{stamp.astype('datetime64[us]')}Z"
     return _attributes_to_disk(given)
 
 

@@ -123,6 +123,7 @@ def test_layout_and_round_trip(tmp_path, form, lazy):
     assert kinds["vibration"] == "int16"
     assert "time" not in kinds  # no stamp per sample
     with xr.open_dataset(path, engine="netcdf4" if form == "nc" else "zarr", chunks={}) as plain:
+        assert plain.attrs["time_coverage_start"] == "2026-09-21T14:13:20.123456Z"
         assert plain.rate.dims == ("axis", "time_index")
         assert plain.rate.chunks == ((1, 1), (CHUNK, CHUNK, 1000))
         assert plain.rate.dtype == np.float64
