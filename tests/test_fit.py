@@ -283,12 +283,17 @@ def test_windows_are_fitted_alike_alone_and_together():
             np.testing.assert_array_equal(alone[name].values[:, 0], together[name].values[:, w])
 
 
+@pytest.fixture(scope="module")
+def quantile_curve():
+    return fit._quantile_curve()
+
+
 @settings(deadline=None)
 @given(st.floats(-4.0, 12.3))
-def test_interpolated_quantile_is_that_of_scipy(exponent):
+def test_interpolated_quantile_is_that_of_scipy(quantile_curve, exponent):
     freedom = np.array([10.0**exponent])
     expected = chi2.ppf(0.05, freedom) / freedom
-    got = interpolate_quantile(freedom, *fit._quantile_curve())
+    got = interpolate_quantile(freedom, *quantile_curve)
     np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-250)
 
 
