@@ -1,0 +1,80 @@
+"""Simulate the experiments of the three papers, all or those named, and put their tables and figures beside ours in docs/seeds.md."""
+
+import re
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+import gyrostab
+from gyrostab.errata import errata
+from gyrostab.plot.style import save_png
+
+ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+
+
+def simulate(name, run):
+    """Make the log of a model, with the changes of this run, and cut out its stretch of time."""
+    model = tomllib.loads(Path(ROOT, "data", "models", f"{name}.toml").read_text(encoding="utf-8"))
+    kept = [part for part in model.get("effect", []) if part["name"] not in run.get("without", [])]
+    model["effect"] = [part | run.get("effects", {}).get(part["name"], {}) for part in kept]
+    log = gyrostab.simulate(model, seed=PLAN["seed"])
+    first, last = (round(run.get(edge, 0) * log.attrs["sampling_rate_hz"]) or None for edge in ("from", "to"))
+    return log.isel(time=slice(first, last))
+
+
+def analyse(log, run):
+    """Go from the log to noise coefficients, and note the processor time of the surface."""
+    log, began = log.compute(), time.process_time()
+    surface = gyrostab.davar(log, **run["davar"]).assign(windows=lambda made: made.sizes["time"])
+    return gyrostab.fit_noise(surface.assign(seconds=time.process_time() - began), **run.get("fit", {}))
+
+
+def number(wanted, products):
+    """Find one number of the table: of which run, variable, axis, averaging time, stretch of time; and over its windows."""
+    product = products[wanted["run"]].sel(tau=wanted.get("tau", 1.0), method="nearest")
+    product = product.sel(axis=wanted["axis"]) if "axis" in wanted else product.isel(axis=0)
+    begin, end = ((product["time_bounds"] - product["time_bounds"].min()) / np.timedelta64(1, "s")).values.T
+    inside = (begin > wanted.get("from", 0) - 1e-6) & (end < wanted.get("to", np.inf) + 1e-6)
+    inside &= np.any([(begin < at) & (at < end) for at in wanted.get("across", [begin + 1e-6])], axis=0)
+    product, over = product.assign(adev=product["avar"].clip(0) ** 0.5).isel(time=inside), getattr(np, wanted.get("over", "nanmedian"))
+    if wanted["of"] + "_upper" in product:
+        seen = product["observable"].sel(term=wanted["of"]) == 2
+        if not seen.any() or (over is np.nanmedian and seen.mean() < 0.5):
+            return f"< {float(np.nanmedian(product[wanted['of'] + '_upper'])):.3g}"
+        return f"{float(over(product[wanted['of']].where(seen))):.4g}"
+    return f"{float(over(product[wanted['of']])):.4g}"
+
+
+def lines(head, rows):
+    """Write a table."""
+    texts = ([f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row] for row in [head, ["---"] * len(head), *rows])
+    return "\n".join(f"| {' | '.join(row)} |" for row in texts)
+
+
+def experiment(name, figures):
+    """Run one experiment, draw its figures, and write its table with the numbers of the paper beside ours."""
+    entry = PLAN["experiment"][name]
+    logs = {run: simulate(name, options) for run, options in entry["run"].items()}
+    products = {run: analyse(logs[run], options) for run, options in entry["run"].items()}
+    for file, options in entry.get("figure", {}).items():
+        shown = (logs if options["draw"] == "plot_signal" else products)[options["run"]]
+        drawn = getattr(gyrostab, options["draw"])(shown, **options.get("with", {}))
+        save_png(drawn, figures / f"seeds-{file}.png", **PLAN["figures"])
+    head, rows = entry["columns"], [(label, row, iter(row.get("paper", []))) for label, row in entry["rows"].items()]
+    cells = [[label, *(next(said, "") if "paper" in to else number(row | to, products) for to in head)] for label, row, said in rows]
+    return lines(["", *(column["title"] for column in head)], cells)
+
+
+def fill(page, name, text):
+    """Put a table between the marks of its name."""
+    return re.sub(rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)", lambda marks: f"{marks[1]}{text}\n{marks[2]}", page, flags=re.S)
+
+
+if __name__ == "__main__":
+    page = ROOT / "docs" / "seeds.md"
+    for chosen in sys.argv[1:] or [*PLAN["experiment"], "errata"]:
+        made = lines(PLAN["errata"], errata()) if chosen == "errata" else experiment(chosen, page.parent / "figures")
+        page.write_text(fill(page.read_text(encoding="utf-8"), chosen, made), encoding="utf-8")
