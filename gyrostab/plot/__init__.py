@@ -8,9 +8,19 @@ from __future__ import annotations
 
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
+from gyrostab.plot.comparison import plot_comparison
 from gyrostab.plot.correlation import plot_correlation
 from gyrostab.plot.figures import save_figures
 from gyrostab.plot.signal import plot_signal
 from gyrostab.plot.surface import plot_davar, plot_davar_3d
 
-__all__ = ["plot_adev", "plot_coefficients", "plot_correlation", "plot_davar", "plot_davar_3d", "plot_signal", "save_figures"]
+__all__ = [
+    "plot_adev",
+    "plot_coefficients",
+    "plot_comparison",
+    "plot_correlation",
+    "plot_davar",
+    "plot_davar_3d",
+    "plot_signal",
+    "save_figures",
+]

@@ -1,0 +1,228 @@
+"""Two logs of the same time beside each other: what something does to a gyro, in four views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.log import make_log
+from gyrostab.plot.signal import thin
+from gyrostab.plot.style import COLOURS, GREY, label_log_axis, new_figure, unit_label
+from gyrostab.plot.surface import CHANGE_CMAP
+from gyrostab.schema import check_log, signal_name
+from gyrostab.windows import duration_seconds
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_comparison"]
+
+Array = NDArray[np.float64]
+_STYLES: tuple[dict[str, Any], dict[str, Any]] = ({"color": GREY, "lw": 2.4}, {"color": COLOURS[0], "lw": 1.1})
+
+
+def plot_comparison(
+    without: xr.Dataset,
+    with_it: xr.Dataset,
+    *,
+    window: Any,
+    step: Any = None,
+    moments: Sequence[Any] = (),
+    driver: str = "",
+    difference: bool = False,
+    coherency: bool = False,
+) -> Figure:
+    """Draw what an effect does: DAVAR, window means and power spectrum of the first axis, and the first two axes together.
+
+    Parameters
+    ----------
+    without, with_it : xarray.Dataset
+        Two regular logs with ``rate(axis, time)`` [degree hour-1] on the same stamps, for instance simulated with one seed.
+    window, step : str, float or timedelta
+        Windows of the dynamic Allan variance, as for `gyrostab.davar`.
+    moments : sequence of float or str
+        Times since the start [s] whose Allan deviation is drawn; by default a map of the ratio over time.
+    driver : str
+        Channel of `with_it` to draw beside the window means.
+    difference : bool
+        Draw the window means less those of `without`: for errors of a rate that is large itself.
+    coherency : bool
+        Draw the coherency of the two axes over frequency, in phase and in quadrature; by default their Allan correlation over averaging
+        time, ``(avar(x + y) - avar(x - y)) / 4`` by the root of their variances, with what chance gives in 95 of 100.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    SchemaError, OptionError
+        When they are no logs of rates, differ in axes or length, have one axis only, or lack the channel.
+
+    Examples
+    --------
+    >>> from gyrostab.simulate import simulate
+    >>> quiet, loud = (simulate({"noise": {"N": n}}, duration="2min", rate=10.0).load() for n in (0.003, 0.006))
+    >>> [panel.get_title() for panel in plot_comparison(quiet, loud, window="20s").axes[:4]]
+    ['σ with / σ without, windows of 20 s', 'Window mean', 'Power spectrum', 'Allan correlation of x and y']
+    """
+    from gyrostab.davar import davar
+
+    logs = without, with_it
+    for log in logs:
+        check_log(log)
+    shapes = {(signal_name(log), tuple(log["axis"].values), log.sizes["time"]) for log in logs}
+    if len(shapes) > 1 or signal_name(without) != "rate" or without.sizes["axis"] < 2:
+        raise OptionError(f"plot_comparison needs two logs of rates with the same two axes or more, and as many samples; not {shapes}")
+    if driver and driver not in with_it:
+        raise OptionError(f"driver {driver!r} is not in the log; it has {', '.join(map(str, with_it.data_vars))}")
+    figure = new_figure(7.6, 4.9)
+    panels = figure.subplots(2, 2)
+    pair = tuple(davar(log, window=window, step=step, taus=30, axis=[str(log["axis"].values[0])]).isel(axis=0).load() for log in logs)
+    seconds = duration_seconds(window, "window")
+    name = f"{seconds / 3600:g} h" if seconds >= 3600 else f"{seconds / 60:g} min" if seconds >= 600 else f"{seconds:g} s"
+    if moments:
+        _curves(panels[0, 0], logs, pair, [duration_seconds(moment, "moment") for moment in moments])
+        panels[0, 0].set_title(f"Allan deviation, windows of {name}")
+    else:
+        _ratio(panels[0, 0], logs, pair)
+        panels[0, 0].set_title(f"σ with / σ without, windows of {name}")
+    _means(panels[0, 1], logs, pair, difference=difference)
+    if driver:
+        _channel(panels[0, 1], with_it, driver)
+    _spectrum(panels[1, 0], logs)
+    (_coherency if coherency else _correlation)(panels[1, 1], logs)
+    for panel in panels.flat:
+        panel.title.set_size("medium")
+        panel.grid(visible=True, lw=0.3, alpha=0.6)
+    return figure
+
+
+def _since(log: xr.Dataset, times: Any) -> tuple[Any, str]:
+    """Times since the start of the log, and their unit: hours for long logs, else minutes."""
+    hour = np.timedelta64(3600 * 10**9, "ns")
+    start, end = log["time"].values[[0, -1]]
+    unit, word = (hour, "h") if end - start > 1.5 * hour else (hour / 60, "min")
+    return (np.asarray(times) - start) / unit, word
+
+
+def _curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> None:
+    centres, word = _since(logs[0], pair[0]["time"].values)
+    tau = pair[0]["tau"].values
+    panel.loglog(tau, np.sqrt(np.nanmean(pair[0]["avar"].values, axis=0)), **_STYLES[0], label="without, mean")
+    for colour, dashes, moment in zip(COLOURS, ("-", "--", "-.", ":"), moments, strict=False):
+        when = moment / {"h": 3600.0, "min": 60.0}[word]
+        curve = np.sqrt(pair[1]["avar"].values[np.abs(centres - when).argmin()])
+        panel.loglog(tau, curve, dashes, color=colour, lw=1.3, label=f"with, at {when:g} {word}")
+    label_log_axis(panel.yaxis, *panel.get_ylim())
+    panel.legend(fontsize="x-small", frameon=False, loc="lower left")
+    panel.set(xlabel="averaging time [s]", ylabel="[deg/h]")
+
+
+def _ratio(panel: Axes, logs: Any, pair: Any) -> None:
+    from matplotlib.colors import LogNorm
+
+    centres, word = _since(logs[0], pair[0]["time"].values)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.sqrt(pair[1]["avar"].values / pair[0]["avar"].values)
+    size = np.abs(np.log(ratio[np.isfinite(ratio) & (ratio > 0)]))
+    reach = float(np.clip(np.exp(np.quantile(size, 0.995)) if size.size else 1.0, 1.1, 1e3))
+    panel.set_facecolor("#d0d0d0")
+    shown: Any = np.ma.masked_invalid(ratio.T)
+    mesh = panel.pcolormesh(
+        centres, pair[0]["tau"].values, shown, norm=LogNorm(1 / reach, reach), cmap=CHANGE_CMAP, shading="nearest", rasterized=True
+    )
+    panel.set(yscale="log", xlabel=f"time [{word}]", ylabel="averaging time [s]")
+    bar = panel.figure.colorbar(mesh, ax=panel, extend="both", pad=0.02)
+    bar.minorticks_off()
+    steps = (1000, 300, 100, 30, 10, 5, 3, 2, 1.5, 1.2, 1.1, 1.05)
+    tick = next(one for one in steps if one <= reach)
+    bar.set_ticks([1 / tick, 1, tick], labels=[f"1/{tick:g}", "1", f"{tick:g}"])
+
+
+def _means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
+    first = pair[0]["window_mean"] if difference else 0.0
+    centres, word = _since(logs[0], pair[0]["time"].values)
+    for product, style, label in zip(pair, _STYLES, ("without", "with"), strict=True):
+        panel.plot(centres, product["window_mean"] - first, **style, label=label)
+    gaps = [_since(logs[0], logs[0][edge].values)[0] for edge in ("gap_start", "gap_end") if logs[0].sizes.get("gap")]
+    if gaps:
+        lost = list(zip(gaps[0], gaps[1] - gaps[0], strict=True))
+        panel.broken_barh(lost, (0, 1), transform=panel.get_xaxis_transform(), color=GREY, alpha=0.5, lw=0, zorder=0.5, label="data lost")
+    panel.set(title="Window mean, less that without" if difference else "Window mean", xlabel=f"time [{word}]", ylabel="[deg/h]")
+    panel.legend(fontsize="x-small", frameon=False)
+
+
+def _channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
+    """Dot a channel behind the window means, on a scale of its own."""
+    twin = panel.twinx()
+    stamps, low, high = thin(log[driver], columns=400)
+    times, _ = _since(log, stamps)
+    if np.nanquantile(high - low, 0.8) <= 0.05 * (np.nanmax(high) - np.nanmin(low)):
+        twin.plot(times, (low + high) / 2, ":", color=COLOURS[1], lw=1.2)
+    else:  # faster than the columns of the figure
+        twin.fill_between(times, low, high, step="mid", color=COLOURS[1], alpha=0.3, lw=0.6)
+    twin.set_ylabel(f"{driver.replace('_', ' ')} {unit_label(log[driver].attrs.get('units'))}", color=COLOURS[1])
+    panel.set(zorder=twin.get_zorder() + 1, facecolor="none")
+
+
+def _filled(log: xr.Dataset) -> tuple[Array, Array]:
+    """The first two axes, straight across the gaps: for spectra."""
+    rows = log["rate"].transpose("axis", "time").values[:2].astype(float)
+    for row in rows:
+        bad = np.isnan(row)
+        row[bad] = np.interp(np.flatnonzero(bad), np.flatnonzero(~bad), row[~bad])
+    return rows[0], rows[1]
+
+
+def _spectrum(panel: Axes, logs: Any) -> None:
+    from scipy.signal import welch
+
+    for log, style in zip(logs, _STYLES, strict=True):
+        how: dict[str, Any] = {"fs": log.attrs["sampling_rate_hz"], "nperseg": max(8, log.sizes["time"] // 10), "detrend": "linear"}
+        f, power = welch(_filled(log)[0], **how)
+        panel.loglog(f[1:], power[1:], **style | {"lw": style["lw"] * 0.8})
+    label_log_axis(panel.yaxis, *panel.get_ylim())
+    panel.set(title="Power spectrum", xlabel="frequency [Hz]", ylabel="[(deg/h)²/Hz]")
+
+
+def _names(log: xr.Dataset) -> str:
+    return " and ".join(str(name) for name in log["axis"].values[:2])
+
+
+def _coherency(panel: Axes, logs: Any) -> None:
+    from scipy.signal import csd, welch
+
+    for log, style, quadrature in zip(logs, _STYLES, (GREY, COLOURS[1]), strict=True):
+        how: dict[str, Any] = {"fs": log.attrs["sampling_rate_hz"], "nperseg": max(8, log.sizes["time"] // 30), "detrend": "linear"}
+        x, y = _filled(log)
+        f, cross = csd(x, y, **how)
+        ratio = cross / np.sqrt(welch(x, **how)[1] * welch(y, **how)[1])
+        panel.semilogx(f[1:], ratio.imag[1:], "--", color=quadrature, lw=0.9, label="in quadrature")
+        panel.semilogx(f[1:], ratio.real[1:], **style | {"lw": style["lw"] * 0.8}, label="in phase")
+    panel.legend(handles=panel.get_lines()[:1:-1], fontsize="x-small", frameon=False)
+    panel.set(title=f"Coherency of {_names(logs[0])}", xlabel="frequency [Hz]", ylim=(-1.1, 1.1))
+
+
+def _correlation(panel: Axes, logs: Any) -> None:
+    from gyrostab.davar import davar
+
+    for log, style in zip(logs, _STYLES, strict=True):
+        x, y = log["rate"].transpose("axis", "time").values[:2]
+        sums = make_log(
+            np.stack([x, y, x + y, x - y]), rate=log.attrs["sampling_rate_hz"], unit="deg/h", axis=["x", "y", "sum", "difference"]
+        )
+        whole = davar(sums, window=sums.sizes["time"], taus=30).isel(time=0).load()
+        a, b, plus, minus = whole["avar"].values
+        with np.errstate(divide="ignore", invalid="ignore"):
+            panel.semilogx(whole["tau"], (plus - minus) / 4.0 / np.sqrt(a * b), **style)
+        if log is logs[0]:
+            chance = 2.0 / np.sqrt(whole["edf"].values[0])
+            panel.fill_between(whole["tau"].values, -chance, chance, color=GREY, alpha=0.15, lw=0)
+    panel.set(title=f"Allan correlation of {_names(logs[0])}", xlabel="averaging time [s]", ylim=(-1.1, 1.1))

@@ -1,0 +1,81 @@
+"""Draw what every physical effect does to a log, with and without it, and put the figures and the table of effects into docs/physics/.
+
+Each effect has its experiment in effect_figures.toml; ``python pipelines/effect_figures.py shupe warm_up`` makes some of them.
+"""
+
+import re
+import sys
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+from gyrostab.physics.registry import effects
+from gyrostab.plot import plot_comparison
+from gyrostab.plot.style import save_png
+from gyrostab.simulate import read_model, simulate
+
+ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+DEFAULTS, OPTIONS = PLAN.pop("defaults"), ("window", "step", "moments", "driver", "difference", "coherency")
+
+
+def twins(name):
+    """Simulate the experiment of an effect without and with it, from the same seed."""
+    entry = PLAN[name]
+    model = read_model({part: DEFAULTS[part] | entry.get(part, {}) for part in ("log", "noise")} | entry.get("also", {}))
+    effect = effects()[name].example(**entry.get("values", {}))
+    return [simulate(replace(model, effects=model.effects + more)).load() for more in ((), (effect,))]
+
+
+def draw(name, folder):
+    """Make the figure of one effect as a small PNG."""
+    options = {key: PLAN[name][key] for key in OPTIONS if key in PLAN[name]}
+    folder.mkdir(parents=True, exist_ok=True)
+    save_png(plot_comparison(*twins(name), **options), folder / f"{name}.png", dpi=120, colours=256)
+    return folder / f"{name}.png"
+
+
+def between(text, mark, new):
+    """Put `new` between the markers of that name."""
+    begin, end = f"<!-- {mark} -->\n", f"<!-- end of {mark} -->\n"
+    return re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: begin + new + end, text, flags=re.S)
+
+
+def illustrate(page):
+    """Give each section of a page the figure of its effect, at its end."""
+    parts = re.split(r"(?m)^(?=## )", page.read_text(encoding="utf-8"))
+    for number, part in enumerate(parts):
+        name = part[3:].split("\n", 1)[0].strip()
+        if part.startswith("## ") and name in PLAN:
+            if "<!-- figure -->" not in part:
+                tail = "\n" if number + 1 < len(parts) else ""
+                part = part.rstrip("\n") + "\n\n<!-- figure -->\n<!-- end of figure -->\n" + tail
+            image = f"![{effects()[name].short}](../figures/effects/{name}.png)\n\n{PLAN[name]['caption']}\n"
+            parts[number] = between(part, "figure", image)
+    page.write_text("".join(parts), encoding="utf-8")
+
+
+def amounts(kind):
+    """The parameters of an effect with their typical sizes."""
+    for known in kind.parameters():
+        sizes = known.typical if isinstance(known.typical, tuple) else (known.typical,)
+        numbers = ", ".join(size if isinstance(size, str) else f"{size:g}" for size in sizes)
+        yield f"`{known.name}` {numbers} {known.unit}".removesuffix(" 1").removesuffix(" text") if sizes else f"`{known.name}`"
+
+
+def rows(pages):
+    """The table of all effects."""
+    for name, kind in effects().items():
+        home = next(page.name for page in pages if f"\n## {name}\n" in page.read_text(encoding="utf-8"))
+        drivers = ", ".join(f"`{channel}`" for channel in kind.channels) or "–"
+        yield f"| [{name}]({home}#{name}) | {kind.short} | {drivers} | {kind.stage} | {'; '.join(amounts(kind))} |\n"
+
+
+if __name__ == "__main__":
+    for wanted in sys.argv[1:] or PLAN:
+        print(draw(wanted, ROOT / "docs" / "figures" / "effects"))
+    index = ROOT / "docs" / "physics" / "README.md"
+    sections = [page for page in index.parent.glob("*.md") if page != index]
+    for section in sections:
+        illustrate(section)
+    head = "| effect | what it does | driver | stage | parameters and typical sizes |\n|---|---|---|---|---|\n"
+    index.write_text(between(index.read_text(encoding="utf-8"), "effects", head + "".join(rows(sections))), encoding="utf-8")
