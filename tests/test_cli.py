@@ -402,6 +402,7 @@ def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
     path = write_log(tmp_path / "long.csv")
     code = (
         "import os, signal, sys, xarray\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background starts with it ignored\n"
         "from gyrostab.cli import main\n"
         "write = xarray.Dataset.to_netcdf\n"
         "def slow(dataset, target, **options):\n"

@@ -282,11 +282,12 @@ def test_drill_string_without_a_gyro(examine, there, recordings):
 
 def test_one_recording_on_the_page(there, tmp_path):
     entry = there("fog-hybrid-warmup-turn")
-    row, section = SCRIPT.describe("fog-hybrid-warmup-turn", entry, tmp_path)
+    row, section, followed = SCRIPT.describe("fog-hybrid-warmup-turn", entry, tmp_path)
     assert row.count("|") == 10
     assert "adamShiau/adamShiau_Python" in row
     assert "3 restarts of the clock" in section
     assert "left out" not in section
+    assert followed == ""  # temperature is compared on the static run
 
 
 def test_the_page_has_a_row_for_every_recording_and_no_path():
