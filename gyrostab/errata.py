@@ -49,8 +49,8 @@ def errata() -> list[Erratum]:
     Examples
     --------
     >>> first = errata()[0]
-    >>> first.where, round(first.as_printed, 1), round(first.in_truth, 2)
-    ('P16 Eq. 5, 12', 10.0, 0.1)
+    >>> first.where, round(first.as_printed), round(first.in_truth, 2)
+    ('P16 Eq. 5, 12', 10, 0.1)
     """
     return [show() for show in _SHOWN]
 
