@@ -29,13 +29,13 @@ _TILE = 2048
 
 def groups(shifts: NDArray[np.int64]) -> NDArray[np.int64]:
     """First averaging factor of each group that goes through the angle together (one shift, `TOGETHER` at most), and the end."""
-    first = [0]
-    while first[-1] < shifts.size:
-        left = 1
-        while first[-1] + left < shifts.size and shifts[first[-1] + left] == shifts[first[-1]]:
-            left += 1
-        first.append(first[-1] + (TOGETHER - 1 if left == TOGETHER + 1 else min(left, TOGETHER)))
-    return np.array(first)
+    starts = np.flatnonzero(np.diff(shifts)) + 1
+    first: list[int] = []
+    for begin, end in zip([0, *starts], [*starts, shifts.size], strict=True):
+        first.extend(range(begin, end, TOGETHER))
+        if (end - begin) % TOGETHER == 1 and end - begin > TOGETHER:
+            first[-1] -= 1  # two and a few rather than one alone
+    return np.array([*first, shifts.size])
 
 
 @njit(**INNER)
