@@ -6,7 +6,6 @@ says in class attributes. `gyrostab.physics.registry` finds it by itself. See do
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, Self
@@ -15,87 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
+from gyrostab.physics.parameters import Parameter, parameter
+from gyrostab.physics.prediction import Array, Prediction, Windows
 
-__all__ = ["STAGES", "Chunk", "Effect", "Parameter", "Prediction", "Setup", "Stage", "Windows", "parameter"]
+__all__ = [
+    "STAGES",
+    "Array",
+    "Chunk",
+    "Effect",
+    "Parameter",
+    "Prediction",
+    "Setup",
+    "Stage",
+    "Windows",
+    "driver_error",
+    "parameter",
+]
 
-Array = NDArray[np.float64]
 Stage = Literal["motion", "noise", "rate", "sensor", "electronics", "sampling", "logger"]
 
 #: What happens to a signal, in the order in which it happens.
 STAGES: tuple[Stage, ...] = ("motion", "noise", "rate", "sensor", "electronics", "sampling", "logger")
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """What is known of one parameter of an effect.
-
-    Attributes
-    ----------
-    name : str
-        Its name in a model.
-    unit : str
-        Unit of its number as people write it ("deg/h/degC"); "text" for a word.
-    meaning : str
-        What it is, in a few words.
-    default : object
-        Value when a model does not give it; None where it must be given.
-    typical : object
-        A published or estimated size, for documentation and tests.
-    low, high : float
-        Allowed range, ends included.
-    choices : tuple of str
-        Allowed words, for a parameter that is a word.
-    many : bool
-        One number for each of the effect's axes, or one for all of them; see `Effect.each`.
-    source : str
-        Where the typical size comes from: author and year, or "estimate".
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    default: Any
-    typical: Any
-    low: float
-    high: float
-    choices: tuple[str, ...]
-    many: bool
-    source: str
-
-    def check(self, value: Any, effect: str) -> Any:
-        """Give `value` back as a float (a tuple of them, a word), or raise `OptionError`."""
-        where = f"effect {effect!r}, parameter {self.name!r}"
-        if self.choices:
-            if value not in self.choices:
-                raise OptionError(f"{where}: {value!r} is not one of {', '.join(self.choices)}")
-            return value
-        given = tuple(value) if isinstance(value, list | tuple) else (value,)
-        if isinstance(value, list | tuple) and not self.many:
-            raise OptionError(f"{where}: give one number in {self.unit}, not the list {value!r}")
-        for number in given:
-            if isinstance(number, bool) or not isinstance(number, int | float | np.number) or math.isnan(number):
-                raise OptionError(f"{where}: {number!r} is not a number; give one in {self.unit}")
-            if not self.low <= number <= self.high:
-                raise OptionError(f"{where}: {number:g} {self.unit} is outside of the allowed range {self.low:g} to {self.high:g}")
-        return tuple(float(number) for number in given) if self.many else float(value)
-
-
-def parameter(
-    unit: str,
-    meaning: str,
-    *,
-    default: Any = None,
-    typical: Any = None,
-    low: float = -math.inf,
-    high: float = math.inf,
-    choices: tuple[str, ...] = (),
-    many: bool = False,
-    source: str = "estimate",
-) -> Any:
-    """Declare a field of an effect; see `Parameter` for the arguments. Without a default a model must give it."""
-    known = {"unit": unit, "meaning": meaning, "typical": default if typical is None else typical, "low": low, "high": high}
-    known |= {"choices": choices, "many": many, "source": source, "default": default}
-    return field(metadata={"parameter": known}) if default is None else field(default=default, metadata={"parameter": known})
 
 
 @dataclass(frozen=True)
@@ -176,75 +115,6 @@ class Chunk:
     def shape(self) -> tuple[int, int]:
         """Shape of the result, (axes, samples)."""
         return len(self.setup.axes), self.size
-
-
-@dataclass(frozen=True)
-class Windows:
-    """The reduced data that *explain* speaks about: means over windows, and spectra in the same windows.
-
-    Attributes
-    ----------
-    begin, end : ndarray, shape (window,)
-        Edges of the windows since the start of the log [s].
-    frequency : ndarray, shape (band,)
-        Centres of the bands of the spectra [Hz].
-    rate : float
-        Sampling rate of the log [Hz].
-    axes : tuple of str
-        The axes looked at.
-    drivers : mapping of str to ndarray, shape (window,)
-        Channels averaged over each window, by the names of `Effect.channels`; vibration as the rms over the window.
-    own : mapping of str to ndarray, shape (window,)
-        Measured rate of every axis of the log, averaged over each window [degree hour-1].
-    gaps, restarts : ndarray, shape (n, 2)
-        As in `Setup`, in seconds.
-    """
-
-    begin: Array
-    end: Array
-    frequency: Array
-    rate: float
-    axes: tuple[str, ...]
-    drivers: Mapping[str, Array] = field(default_factory=dict)
-    own: Mapping[str, Array] = field(default_factory=dict)
-    gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
-    restarts: Array = field(default_factory=lambda: np.empty((0, 2)))
-
-    @property
-    def centre(self) -> Array:
-        """Middle of every window since the start of the log [s]."""
-        return (self.begin + self.end) / 2.0
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """What an effect predicts for `Windows`; each part that it leaves empty it does not touch.
-
-    The parts are linear in the parameters named by their keys, so that a fit can solve for these; a parameter in which the effect
-    is not linear is one of `Effect.nuisance`, and is held at the value of the effect that was asked.
-
-    Attributes
-    ----------
-    mean : mapping of str to ndarray, shape (window,) or (axis, window)
-        Parameter -> window mean per unit of it [degree hour-1 per unit].
-    level : mapping of (str, str) to ndarray, shape (window,) or (axis, window)
-        (symbol of the noise term, parameter) -> change of the term's squared coefficient per unit, as a share of it.
-    spectrum : mapping of str to ndarray, shape (window, band) or (axis, window, band)
-        Parameter -> added two-sided power spectral density per unit of its square [degree2 hour-2 Hz-1].
-    response : ndarray, shape (band,), or None
-        Squared magnitude by which the whole spectrum is multiplied (a filter).
-    coherent : bool
-        The added spectrum is one process on all axes: it fills the cross-spectra too, with one factor (and sign) per axis.
-    line : ndarray, shape (window,) or (harmonic, window), or None
-        Frequency of a line in every window [Hz], folded below half of the sampling rate.
-    """
-
-    mean: Mapping[str, Array] = field(default_factory=dict)
-    level: Mapping[tuple[str, str], Array] = field(default_factory=dict)
-    spectrum: Mapping[str, Array] = field(default_factory=dict)
-    response: Array | None = None
-    coherent: bool = False
-    line: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

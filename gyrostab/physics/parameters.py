@@ -1,0 +1,86 @@
+"""What is known of one parameter of an effect: its unit, range, usual size and source."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gyrostab.errors import OptionError
+
+__all__ = ["Parameter", "parameter"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What is known of one parameter of an effect.
+
+    Attributes
+    ----------
+    name : str
+        Its name in a model.
+    unit : str
+        Unit of its number as people write it ("deg/h/degC"); "text" for a word.
+    meaning : str
+        What it is, in a few words.
+    default : object
+        Value when a model does not give it; None where it must be given.
+    typical : object
+        A published or estimated size, for documentation and tests.
+    low, high : float
+        Allowed range, ends included.
+    choices : tuple of str
+        Allowed words, for a parameter that is a word.
+    many : bool
+        One number for each of the effect's axes, or one for all of them; see `Effect.each`.
+    source : str
+        Where the typical size comes from: author and year, or "estimate".
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    default: Any
+    typical: Any
+    low: float
+    high: float
+    choices: tuple[str, ...]
+    many: bool
+    source: str
+
+    def check(self, value: Any, effect: str) -> Any:
+        """Give `value` back as a float (a tuple of them, a word), or raise `OptionError`."""
+        where = f"effect {effect!r}, parameter {self.name!r}"
+        if self.choices:
+            if value not in self.choices:
+                raise OptionError(f"{where}: {value!r} is not one of {', '.join(self.choices)}")
+            return value
+        given = tuple(value) if isinstance(value, list | tuple) else (value,)
+        if isinstance(value, list | tuple) and not self.many:
+            raise OptionError(f"{where}: give one number in {self.unit}, not the list {value!r}")
+        for number in given:
+            if isinstance(number, bool) or not isinstance(number, int | float | np.number) or math.isnan(number):
+                raise OptionError(f"{where}: {number!r} is not a number; give one in {self.unit}")
+            if not self.low <= number <= self.high:
+                raise OptionError(f"{where}: {number:g} {self.unit} is outside of the allowed range {self.low:g} to {self.high:g}")
+        return tuple(float(number) for number in given) if self.many else float(value)
+
+
+def parameter(
+    unit: str,
+    meaning: str,
+    *,
+    default: Any = None,
+    typical: Any = None,
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+    many: bool = False,
+    source: str = "estimate",
+) -> Any:
+    """Declare a field of an effect; see `Parameter` for the arguments. Without a default a model must give it."""
+    known = {"unit": unit, "meaning": meaning, "typical": default if typical is None else typical, "low": low, "high": high}
+    known |= {"choices": choices, "many": many, "source": source, "default": default}
+    return field(metadata={"parameter": known}) if default is None else field(default=default, metadata={"parameter": known})
