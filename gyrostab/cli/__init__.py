@@ -1,0 +1,57 @@
+"""The command line: parse, call, print. Every module of `gyrostab.cli.commands` adds its commands by itself.
+
+Exit codes: 0 done; 2 bad input or usage, with one message on stderr; 3 interrupted; 1 anything else. No traceback unless ``--debug``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+from collections.abc import Sequence
+
+from gyrostab.cli import commands
+from gyrostab.cli.frame import app
+from gyrostab.console import complain, explain, plain_notes, read_config, stoppable
+
+__all__ = ["app", "main"]
+
+for _module in pkgutil.iter_modules(commands.__path__):
+    importlib.import_module(f"{commands.__name__}.{_module.name}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Arguments after the program's name; those of the process when absent.
+
+    Returns
+    -------
+    int
+        Exit code.
+
+    Examples
+    --------
+    >>> main(["fit", "davar.nc"])
+    2
+    """
+    tokens = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in tokens
+    try:
+        app.config = read_config(tokens, [command for command in app if not command.startswith("-")])
+        with plain_notes(), stoppable():
+            app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+    except KeyboardInterrupt as stop:
+        said = str(stop) or "interrupted; nothing was written under the name of the output. Start the same command again."
+        return complain(said, 3)
+    except BrokenPipeError:  # the reader of our output, for instance `head`, has left
+        sys.stderr.close()
+        return 0
+    except Exception as error:
+        if debug:
+            raise
+        return explain(error)
+    return 0

@@ -1,0 +1,80 @@
+"""Commands that take logs and give what is in them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from gyrostab.cli.frame import Logs, Output, app, work
+from gyrostab.errors import FormatError, OptionError
+from gyrostab.options import Common, Reading
+
+__all__ = ["ingest", "scan"]
+
+
+@app.command(sort_key=1, help_epilogue="")
+def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common()) -> None:
+    """Say what is in some logs: span, sampling rate, axes, channels, gaps, and what is odd.
+
+    Example: gyrostab scan run7/*.csv
+
+    Parameters
+    ----------
+    logs
+        One or more logs, in any format that gyrostab reads.
+    """
+    from gyrostab.scan import print_scan
+    from gyrostab.scan import scan as scan_logs
+
+    table = scan_logs(logs, **reading.options())
+    print_scan(table)
+    lost = table[table["format"].isna()]
+    if len(lost):
+        raise FormatError(f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; the table says why")
+
+
+@app.command(sort_key=2, help_epilogue="")
+def ingest(
+    logs: Logs,
+    /,
+    *,
+    output: Output,
+    compression: Literal["zstd", "zlib"] | None = None,
+    reading: Reading = Reading(),
+    common: Common = Common(),
+) -> None:
+    """Put logs on one uniform time axis, with the gaps marked, and write them as NetCDF or Zarr.
+
+    Integer counts stay integers. The logs may be larger than the memory.
+
+    Example: gyrostab ingest run7/*.csv -o run7.nc
+
+    Parameters
+    ----------
+    logs
+        One or more logs, in any order.
+    output
+        File to write, LOG.nc or LOG.zarr.
+    compression
+        Of a NetCDF file: zstd is fast, zlib is read by programs that lack zstd, such as Octave and R on many systems (default: zstd).
+    """
+    from gyrostab.export import to_netcdf, to_zarr
+    from gyrostab.run import check_output, load_log, samples_of
+
+    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite, inputs=logs)
+    zarr = target.suffix.lower() == ".zarr"
+    if zarr and compression:
+        raise OptionError(f"--compression {compression} is for NetCDF, and {output} is Zarr; leave it out")
+    with work(common) as stage:
+        stage("reading", 0)
+        log = load_log(logs, **reading.options())
+        samples = samples_of(log)
+        stage("writing", samples)
+
+        def tell(share: float) -> None:
+            stage("writing", samples, round(share * samples))
+
+        if zarr:
+            to_zarr(log, target, overwrite=common.overwrite, progress=tell)
+        else:
+            to_netcdf(log, target, overwrite=common.overwrite, compression=compression, progress=tell)
+    print(target)

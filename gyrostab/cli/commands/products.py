@@ -1,0 +1,161 @@
+"""Commands that take a product."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from gyrostab.cli.frame import Output, Product, app, work
+from gyrostab.options import ChannelFile, Common
+
+__all__ = ["correlate", "export", "plot", "report"]
+
+
+@app.command(sort_key=6, help_epilogue="")
+def report(
+    product: Product,
+    /,
+    *,
+    output: Output,
+    log: Path | None = None,
+    common: Common = Common(),
+) -> None:
+    """Make one self-contained HTML page of a product, with figures.
+
+    Example: gyrostab report product.nc -o report.html --log run7.nc
+
+    Parameters
+    ----------
+    product
+        File that gyrostab run or gyrostab fit wrote.
+    output
+        HTML file to write.
+    log
+        Log that the product was made of, to show the signal too.
+    """
+    from gyrostab.export import open_log, open_product
+    from gyrostab.report import write_report
+    from gyrostab.run import check_output
+
+    target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite, inputs=[product])
+    with work(common) as stage:
+        stage("drawing", 0)
+        write_report(open_product(product), target, log=open_log(log) if log else None, overwrite=common.overwrite)
+    print(target)
+
+
+@app.command(sort_key=7, help_epilogue="")
+def correlate(
+    product: Product,
+    /,
+    *,
+    with_: Annotated[str, Parameter(name="--with", metavar="CHANNEL")] = "temperature",
+    max_lag: Annotated[str | None, Parameter(metavar="DURATION")] = None,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"], metavar="FILE")] = None,
+    other: ChannelFile = ChannelFile(),
+    common: Common = Common(),
+) -> None:
+    """Say whether noise coefficients and window means follow temperature or another channel, how much and how late.
+
+    Example: gyrostab correlate product.nc --with temperature --max-lag 2h -o coupling.nc
+
+    Parameters
+    ----------
+    product
+        File that gyrostab run or gyrostab fit wrote.
+    with_
+        Channel of the product, or of the file given by --channel.
+    max_lag
+        Longest time by which the gyro may follow the channel (default: a tenth of the record; 0s for none).
+    output
+        NetCDF file to write: the product with the correlation beside it; a figure of the same name in PNG stands beside it.
+    """
+    from gyrostab.correlate import correlate as compute
+    from gyrostab.correlate import format_correlation, join
+    from gyrostab.export import open_product, to_netcdf
+    from gyrostab.output import new_output
+    from gyrostab.plot.correlation import plot_correlation
+    from gyrostab.plot.style import save_png
+    from gyrostab.read.channel import read_channel
+    from gyrostab.run import check_output
+
+    given, file = other.options(), other.channel
+    inputs = [product, file] if file else [product]
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=inputs) if output else None
+    picture = check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
+    with work(common) as stage:
+        stage("correlating", 0)
+        dataset = open_product(product)
+        found = compute(dataset, channel=read_channel(file, with_, **given) if file else with_, max_lag=max_lag)
+        if target and picture:
+            to_netcdf(join(dataset, found), target, overwrite=common.overwrite)
+            with new_output(picture, overwrite=common.overwrite) as temporary:
+                save_png(plot_correlation(found), temporary)
+    print(format_correlation(found))
+    if target:
+        print(f"\n{target}\n{picture}")
+
+
+@app.command(sort_key=8, help_epilogue="")
+def plot(
+    product: Product,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")],
+    common: Common = Common(),
+) -> None:
+    """Draw all the figures of a product as PNG: coefficients, also against temperature, dynamic Allan deviation as map and surface.
+
+    Example: gyrostab plot product.nc -o figures
+
+    Parameters
+    ----------
+    product
+        File that gyrostab run or gyrostab fit wrote.
+    output
+        Folder to write into.
+    """
+    from gyrostab.export import open_product
+    from gyrostab.plot.figures import save_figures
+
+    with work(common) as stage:
+        stage("drawing", 0)
+        files = save_figures(open_product(product), output, overwrite=common.overwrite)
+    print(*files, sep="\n")
+
+
+@app.command(sort_key=9, help_epilogue="")
+def export(
+    product: Product,
+    /,
+    *,
+    output: Output,
+    format: Literal["kalibr", "zarr"],
+    common: Common = Common(),
+) -> None:
+    """Hand a product over to other programs: the noise for Kalibr and the ROS tools (YAML), or the whole product as Zarr.
+
+    Example: gyrostab export product.nc -o imu.yaml --format kalibr
+
+    Parameters
+    ----------
+    product
+        File that gyrostab run or gyrostab fit wrote.
+    output
+        File to write (YAML), or directory (Zarr).
+    format
+        kalibr: N, K and B in radians, the worst axis and each of them; zarr: everything.
+    """
+    from gyrostab.export import open_product, to_zarr
+    from gyrostab.kalibr import to_kalibr
+    from gyrostab.run import check_output
+
+    writers: dict[str, tuple[Any, list[str]]] = {"kalibr": (to_kalibr, [".yaml", ".yml"]), "zarr": (to_zarr, [".zarr"])}
+    write, suffixes = writers[format]
+    target = check_output(output, suffixes=suffixes, overwrite=common.overwrite, inputs=[product])
+    with work(common) as stage:
+        stage("writing", 0)
+        write(open_product(product), target, overwrite=common.overwrite)
+    print(target)

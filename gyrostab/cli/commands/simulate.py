@@ -1,0 +1,61 @@
+"""A log from a model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from gyrostab.cli.frame import Output, app, work
+from gyrostab.options import Common, Reading
+
+__all__ = ["simulate"]
+
+
+@app.command(sort_key=10, help_epilogue="")
+def simulate(
+    model: Annotated[Path, Parameter(name="MODEL")],
+    /,
+    *,
+    output: Output,
+    duration: Annotated[str | None, Parameter(metavar="DURATION")] = None,
+    like: Annotated[list[Path] | None, Parameter(metavar="RECORDING", negative=())] = None,
+    seed: Annotated[int | None, Parameter(metavar="N")] = None,
+    reading: Reading = Reading(),
+    common: Common = Common(),
+) -> None:
+    """Simulate a gyro log from a model of its noise, its environment and physical effects.
+
+    Every other command takes the log. It may be larger than the memory.
+
+    Example: gyrostab simulate model.toml -o log.nc --duration 1h --rate 100 --seed 1
+
+    Parameters
+    ----------
+    model
+        TOML file with [noise], [[effect]], [[environment]] and [log]; see docs/simulate.md.
+    output
+        File to write, LOG.nc or LOG.zarr.
+    duration
+        Length of the log: 1h, 200h. --rate and --start give sampling rate and first time; all three may stand in the model.
+    like
+        Recording whose time stamps, gaps and channels are taken instead. Repeat for more files of it.
+    seed
+        Seed of the random numbers: the same log for the same seed, the same noise with and without effects (default: the model's, or 0).
+    """
+    from gyrostab.export import to_netcdf, to_zarr
+    from gyrostab.run import check_output, load_log, samples_of
+    from gyrostab.simulate import simulate as make
+
+    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite, inputs=[model, *(like or [])])
+    with work(common) as stage:
+        stage("reading", 0)
+        if like:
+            log = make(model, like=load_log(like, **reading.options()), duration=duration, seed=seed)
+        else:
+            log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
+        stage("simulating", samples_of(log))
+        write = to_zarr if target.suffix == ".zarr" else to_netcdf
+        write(log, target, overwrite=common.overwrite)
+    print(target)

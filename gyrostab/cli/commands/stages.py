@@ -1,0 +1,127 @@
+"""Commands on the way from logs to the product."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from gyrostab.cli.frame import Logs, Output, app, work
+from gyrostab.options import Common, Fitting, Reading, Running, Windows
+
+__all__ = ["davar", "fit", "run"]
+
+
+@app.command(sort_key=3, help_epilogue="")
+def run(
+    logs: Logs,
+    /,
+    *,
+    output: Output,
+    windows: Windows = Windows(),
+    fitting: Fitting = Fitting(),
+    reading: Reading = Reading(),
+    running: Running = Running(),
+    common: Common = Common(),
+) -> None:
+    """Go the whole way from logs to the product: uniform time, dynamic Allan variance, noise coefficients, NetCDF.
+
+    The log may be larger than the memory. A run that was stopped goes on with --resume.
+
+    Example: gyrostab run run7/*.csv -o product.nc --window 10min --step 1min
+
+    Parameters
+    ----------
+    logs
+        One or more logs, in any order.
+    output
+        NetCDF file to write.
+    """
+    from gyrostab.run import run as run_job
+
+    with work(common) as stage:
+        target = run_job(
+            logs,
+            output,
+            reading=reading.options(),
+            windows=windows.options(),
+            fitting=fitting.options(),
+            overwrite=common.overwrite,
+            resume=running.resume,
+            scheduler=running.scheduler,
+            workers=common.workers,
+            stage=stage,
+        )
+    print(target)
+
+
+@app.command(sort_key=4, help_epilogue="")
+def davar(
+    logs: Logs,
+    /,
+    *,
+    output: Output,
+    windows: Windows = Windows(),
+    reading: Reading = Reading(),
+    running: Running = Running(),
+    common: Common = Common(),
+) -> None:
+    """Compute the dynamic Allan variance of a log.
+
+    Example: gyrostab davar run7.nc -o davar.nc --window 10min --step 1min
+
+    Parameters
+    ----------
+    logs
+        Log that gyrostab ingest wrote, or logs in any format.
+    output
+        NetCDF file to write.
+    """
+    from gyrostab.run import run as run_job
+
+    with work(common) as stage:
+        target = run_job(
+            logs,
+            output,
+            reading=reading.options(),
+            windows=windows.options(),
+            surface_only=True,
+            overwrite=common.overwrite,
+            resume=running.resume,
+            scheduler=running.scheduler,
+            workers=common.workers,
+            stage=stage,
+        )
+    print(target)
+
+
+@app.command(sort_key=5, help_epilogue="")
+def fit(
+    surface: Annotated[Path, Parameter(name="DAVAR")],
+    /,
+    *,
+    output: Output,
+    fitting: Fitting = Fitting(),
+    common: Common = Common(),
+) -> None:
+    """Fit the noise coefficients Q, N, B, K and R in every window of a dynamic Allan variance.
+
+    Example: gyrostab fit davar.nc -o product.nc
+
+    Parameters
+    ----------
+    surface
+        File that gyrostab davar wrote.
+    output
+        NetCDF file to write.
+    """
+    from gyrostab.export import open_surface, to_netcdf
+    from gyrostab.fit import fit_noise
+    from gyrostab.run import check_output
+
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[surface])
+    with work(common) as stage:
+        stage("fitting", 0)
+        to_netcdf(fit_noise(open_surface(surface), **fitting.options()), target, overwrite=common.overwrite)
+    print(target)

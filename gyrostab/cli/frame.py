@@ -1,0 +1,39 @@
+"""What the commands share: the program that they belong to, their usual arguments, and the frame of their work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
+
+from gyrostab.options import Common
+
+__all__ = ["Logs", "Output", "Product", "app", "work"]
+
+Logs = Annotated[list[Path], Parameter(name="LOG...", negative=())]
+Product = Annotated[Path, Parameter(name="PRODUCT")]
+Output = Annotated[Path, Parameter(name=["--output", "-o"], metavar="FILE")]
+
+app = App(
+    name="gyrostab",
+    help="Dynamic Allan variance of gyro logs: from raw logs of drilling tools to noise coefficients that vary with time.",
+    help_epilogue="First try: gyrostab demo -o demo-output. Each command explains itself: gyrostab run --help.",
+    version_flags=["--version"],
+    help_format="plaintext",
+    suppress_keyboard_interrupt=False,
+)
+
+
+@contextmanager
+def work(common: Common) -> Iterator[Any]:
+    """Set the number of cores, and show the stages of the work."""
+    import dask
+
+    from gyrostab.progress import show_progress
+
+    chosen = {"num_workers": common.workers} if common.workers else {}
+    with dask.config.set(scheduler="threads", **chosen), show_progress(quiet=common.quiet_progress) as stage:
+        yield stage
