@@ -1,0 +1,145 @@
+"""Block means of a random bias in one pass: whitening by a Kalman filter with a free constant.
+
+The bias is a random walk from an unknown start (the free constant), plus Ornstein-Uhlenbeck processes, plus white noise. What is
+observed are means over blocks that follow each other, so the moments are those of means, not of points.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import INNER, KERNEL
+
+__all__ = ["whiten"]
+
+Array = NDArray[np.float64]
+
+
+@njit(**INNER)
+def _moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared):  # type: ignore[no-untyped-def]
+    """Fill in, for a block of `step` seconds: how each state goes on, its weight in the mean, the variance of what is new at the end,
+    and the covariance of that with the mean; returns the variance of the mean when the states at the start are known.
+    """
+    decay[0], weight[0], drive[0], shared[0] = 1.0, 1.0, K2 * step, K2 * step / 2.0
+    rest = K2 * step / 3.0
+    for j in range(ou_variance.size):
+        v, a = ou_variance[j], step / ou_time[j]
+        lost = -np.expm1(-a)
+        decay[j + 1] = 1.0 - lost
+        weight[j + 1] = lost / a
+        drive[j + 1] = v * lost * (2.0 - lost)
+        shared[j + 1] = v * lost * lost / a
+        if a < 1e-3:  # the differences below lose their digits
+            rest += v * a * (2.0 / 3.0 - a / 2.0 + 7.0 * a * a / 30.0)
+        else:
+            rest += v * (2.0 * (a - lost) - lost * lost) / (a * a)
+    return rest
+
+
+@njit(**INNER)
+def _advance(covariance, decay, drive):  # type: ignore[no-untyped-def]
+    m = decay.size
+    for i in range(m):
+        for j in range(m):
+            covariance[i, j] *= decay[i] * decay[j]
+        covariance[i, i] += drive[i]
+
+
+@njit(fastmath={"contract"}, **INNER)
+def _innovations(row, state, weight, decay, gain, scale, out):  # type: ignore[no-untyped-def]
+    """Scaled innovations of all columns to `out`; the states of all columns to the next block."""
+    for c in range(row.size):
+        out[c] = row[c] - state[0, c]
+    for j in range(1, weight.size):
+        h = weight[j]
+        for c in range(row.size):
+            out[c] -= h * state[j, c]
+    for j in range(weight.size):
+        f, g = decay[j], gain[j]
+        for c in range(row.size):
+            state[j, c] = f * state[j, c] + g * out[c]
+    for c in range(row.size):
+        out[c] *= scale
+
+
+@njit(**KERNEL)
+def whiten(
+    columns: Array,
+    variance: Array,
+    step_seconds: Array,
+    present: NDArray[np.bool_],
+    K2: float,
+    ou_variance: Array,
+    ou_time: Array,
+) -> tuple[Array, float]:
+    """Whiten columns of block means by the covariance V of their noise, a constant of unknown size taken out.
+
+    Products of whitened columns a, b are ``a' W b`` with ``W = V^-1 - V^-1 1 (1' V^-1 1)^-1 1' V^-1`` over the blocks present.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (n, m)
+        Data and designs; all finite, whatever they are where not present.
+    variance : ndarray, shape (n,)
+        White variance of every block mean.
+    step_seconds : ndarray, shape (n,)
+        Length of every block, which ends where the next one begins [s].
+    present : ndarray of bool, shape (n,)
+        False for blocks that are missing or held out.
+    K2 : float
+        Variance of the random walk in a second.
+    ou_variance, ou_time : ndarray, shape (p,)
+        Variances and correlation times [s] of the Ornstein-Uhlenbeck processes.
+
+    Returns
+    -------
+    whitened : ndarray, shape (n, m)
+        Rows not present are zero, and so is the first row present, which the constant takes.
+    log_determinant : float
+        ``log det V + log(1' V^-1 1)`` over the blocks present; 0 when there are none.
+    """
+    n, width = columns.shape
+    m = ou_variance.size + 1
+    out = np.zeros((n, width))
+    state = np.zeros((m, width))
+    room = np.zeros((5, m))
+    decay, weight, drive, shared, gain = room[0], room[1], room[2], room[3], room[4]
+    covariance = np.zeros((m, m))
+    for j in range(1, m):
+        covariance[j, j] = ou_variance[j - 1]
+    total, known, last, rest = 0.0, False, np.nan, 0.0
+    for i in range(n):
+        if step_seconds[i] != last:
+            last = step_seconds[i]
+            rest = _moments(last, K2, ou_variance, ou_time, decay, weight, drive, shared)
+        if not present[i]:
+            for j in range(m):
+                for c in range(width):
+                    state[j, c] *= decay[j]
+            _advance(covariance, decay, drive)
+            continue
+        F = variance[i] + rest  # of the innovation; without the level, where that is not known yet
+        for j in range(0 if known else 1, m):
+            gain[j] = 0.0
+            for k in range(0 if known else 1, m):
+                gain[j] += covariance[j, k] * weight[k]
+            F += gain[j] * weight[j]
+        if not known:  # the level becomes what the mean says, with the error of all the rest
+            known = True
+            _advance(covariance, decay, drive)
+            covariance[0, 0] = F + drive[0] - 2.0 * shared[0]
+            for j in range(1, m):
+                covariance[0, j] = covariance[j, 0] = -gain[j] * decay[j] - shared[j]
+            state[0] = columns[i]
+            continue
+        for j in range(m):
+            gain[j] = (decay[j] * gain[j] + shared[j]) / F
+        _innovations(columns[i], state, weight, decay, gain, 1.0 / np.sqrt(F), out[i])
+        _advance(covariance, decay, drive)
+        for j in range(m):
+            for k in range(m):
+                covariance[j, k] -= gain[j] * gain[k] * F
+        total += np.log(F)
+    return out, total

@@ -1,0 +1,96 @@
+"""Whitening of block means against dense linear algebra."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab.kernels.state_space import whiten
+
+
+def walk_covariance(edges: np.ndarray) -> np.ndarray:
+    """Covariance of the means over blocks of a Brownian motion that begins at the first edge, by integration of min(s, t)."""
+    begin, end = edges[:-1] - edges[0], edges[1:] - edges[0]
+    covariance = np.minimum.outer((begin + end) / 2.0, (begin + end) / 2.0)
+    covariance[np.diag_indices(begin.size)] = begin + (end - begin) / 3.0
+    return covariance
+
+
+def relaxation_covariance(edges: np.ndarray, time: float) -> np.ndarray:
+    """Covariance of the means over blocks of an Ornstein-Uhlenbeck process of unit variance: double integral of exp(-|s - t| / T)."""
+    begin, end = edges[:-1], edges[1:]
+    step = end - begin
+    fall = -np.expm1(-step / time) * time / step
+    apart = np.maximum(begin[:, None] - end[None, :], begin[None, :] - end[:, None])
+    covariance = np.exp(-apart / time) * np.outer(fall, fall)
+    a = step / time
+    covariance[np.diag_indices(step.size)] = 2.0 * (a + np.expm1(-a)) / a**2
+    return covariance
+
+
+def dense(columns, variance, step, present, K2, ou_variance, ou_time):
+    edges = np.concatenate([[0.0], np.cumsum(step)])
+    V = np.diag(variance) + K2 * walk_covariance(edges)
+    for v, time in zip(ou_variance, ou_time, strict=True):
+        V = V + v * relaxation_covariance(edges, time)
+    V, X, one = V[np.ix_(present, present)], columns[present], np.ones(present.sum())
+    L = np.linalg.cholesky(V)
+    A, u = np.linalg.solve(L, X), np.linalg.solve(L, one)
+    products = A.T @ A - np.outer(A.T @ u, A.T @ u) / (u @ u)
+    return products, 2.0 * np.log(np.diag(L)).sum() + np.log(u @ u)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10**6), missing=st.floats(0.0, 0.8), K=st.sampled_from([0.0, 0.01, 1.0]), processes=st.integers(0, 5))
+def test_products_and_determinant_are_those_of_the_dense_covariance(seed, missing, K, processes):
+    rng = np.random.default_rng(seed)
+    n = 60
+    step = np.full(n, 20.0) if seed % 2 else rng.uniform(1.0, 30.0, n)
+    present = rng.random(n) >= missing
+    present[rng.choice(n, 3, replace=False)] = True
+    columns = rng.standard_normal((n, 4)) + 5.0
+    variance = rng.uniform(0.5, 2.0, n)
+    case = (columns, variance, step, present, K**2, rng.uniform(0.1, 3.0, processes), 10.0 ** rng.uniform(0.0, 5.0, processes))
+    whitened, log_determinant = whiten(*case)
+    products, expected = dense(*case)
+    np.testing.assert_allclose(whitened.T @ whitened, products, rtol=1e-8, atol=1e-8)
+    assert log_determinant == pytest.approx(expected, rel=1e-8, abs=1e-8)
+    assert not whitened[~present].any()
+
+
+def test_a_constant_is_taken_out_and_nothing_else():
+    rng = np.random.default_rng(3)
+    n = 50
+    case = (np.ones(n), np.full(n, 20.0), rng.random(n) > 0.3, 1e-3, np.array([0.2]), np.array([100.0]))
+    columns = rng.standard_normal((n, 2))
+    plain, _ = whiten(columns, *case)
+    moved, _ = whiten(columns + np.array([1e6, 0.0]), *case)
+    np.testing.assert_allclose(moved, plain, atol=1e-8)
+    constant, _ = whiten(np.ones((n, 1)), *case)
+    assert np.abs(constant).max() < 1e-12
+
+
+def test_white_noise_alone_leaves_deviations_from_the_mean():
+    values = np.array([[1.0], [2.0], [4.0]])
+    whitened, log_determinant = whiten(values, np.full(3, 0.5), np.ones(3), np.ones(3, bool), 0.0, np.empty(0), np.empty(0))
+    assert (whitened**2).sum() == pytest.approx(((values - values.mean()) ** 2).sum() / 0.5)
+    assert log_determinant == pytest.approx(3 * np.log(0.5) + np.log(3 / 0.5))
+
+
+def test_nothing_present_gives_nothing():
+    case = (np.ones(5), np.ones(5), np.zeros(5, bool), 1.0, np.ones(1), np.ones(1))
+    whitened, log_determinant = whiten(np.ones((5, 2)), *case)
+    assert not whitened.any()
+    assert log_determinant == 0.0
+
+
+def test_slow_and_fast_processes_keep_their_digits():
+    rng = np.random.default_rng(5)
+    n = 40
+    case = (rng.standard_normal((n, 2)), np.full(n, 1e-3), np.full(n, 1.0), np.ones(n, bool), 0.0, np.ones(3), np.array([999.0, 1e6, 1e-2]))
+    whitened, log_determinant = whiten(*case)
+    products, expected = dense(*case)
+    np.testing.assert_allclose(whitened.T @ whitened, products, rtol=1e-7)
+    assert log_determinant == pytest.approx(expected, rel=1e-8)
