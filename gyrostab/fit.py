@@ -10,7 +10,7 @@ import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
+from scipy.special import gammaincc, gammaincinv
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.covariance import STOCHASTIC, product_tables
@@ -21,12 +21,16 @@ from gyrostab.noise import LAWS, TERMS, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_surface
 from gyrostab.windows import duration_seconds, thin
 
-__all__ = ["fit_noise"]
+__all__ = ["fit_noise", "fit_part"]
 
 #: Averaging times used at most; more of them share the same information and cost the cube of their number.
 MOST_TAUS = 48
 #: One-sided normal quantiles: 95 % for limits, 99 % for the claim that a term is there.
 _LIMIT, _CLAIM = 1.6449, 2.3263
+#: The model does not fit where chance alone would make the misfit in fewer windows than this.
+_MISFIT = 1e-3
+#: A window that the model does not fit bounds its terms (but Q) within its longest averaging times: a decade of them.
+_DECADE = 10.0
 #: More degrees of freedom than this are as good as infinitely many for the limit of a cell.
 _MOST_FREEDOM = 1e6
 #: A column that the other terms imitate to all but this share cannot be told apart.
@@ -87,6 +91,45 @@ def fit_noise(
     >>> round(float(product.N.mean()), 3)
     0.01
     """
+    return _fit(surface, terms=terms, method=method, tau_min=tau_min, tau_max=tau_max)
+
+
+def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
+    """Fit a surface in memory at once and in the calling thread: a part of a record, beside which others are fitted.
+
+    Parameters
+    ----------
+    surface : xarray.Dataset
+        What `gyrostab.davar.davar_part` returns.
+    **options
+        Options of `fit_noise`.
+
+    Returns
+    -------
+    xarray.Dataset
+        As from `fit_noise`, bit for bit.
+
+    Examples
+    --------
+    >>> from gyrostab.davar import davar_part
+    >>> from gyrostab.log import make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(60_000), rate=100.0, unit="deg/h")
+    >>> surface = davar_part(log, part=slice(0, 4), window="1min")
+    >>> fit_part(surface, terms="NK").equals(fit_noise(surface, terms="NK"))
+    True
+    """
+    return _fit(surface, **options, here=True)
+
+
+def _fit(
+    surface: xr.Dataset,
+    *,
+    terms: str | Iterable[str] = "QNBKR",
+    method: str = "gls",
+    tau_min: Any = None,
+    tau_max: Any = None,
+    here: bool = False,
+) -> xr.Dataset:
     check_surface(surface)
     wanted = list(terms)
     unknown = [term for term in wanted if term not in TERMS]
@@ -96,7 +139,7 @@ def fit_noise(
         raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
     allowed = sum(1 << TERMS.index(term) for term in wanted)
     chosen = _within(surface["tau"].values, tau_min, tau_max)
-    return _fit_gls(surface, allowed, chosen) if method == "gls" else _fit_adev(surface, wanted, chosen)
+    return _fit_gls(surface, allowed, chosen, here=here) if method == "gls" else _fit_adev(surface, wanted, chosen)
 
 
 def _within(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
@@ -123,7 +166,7 @@ def _inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, i
     return [surface[name].data for name in names], ks, rate, window
 
 
-def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64]) -> xr.Dataset:
+def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool) -> xr.Dataset:
     cells, ks, rate, window = _inputs(surface)
     chosen = within[_choose(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
@@ -133,21 +176,24 @@ def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64]) -> xr
         flat = [np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64) for a in arrays]
         return _fit_block(flat, tables, allowed).reshape(arrays[0].shape[0], arrays[0].shape[1], -1)
 
-    width = len(TERMS) * 4 + 2 + chosen.size
-    lazy = isinstance(cells[0], da.Array)
-    whole = [cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1)) for cell in cells]
-    fitted = da.map_blocks(block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64)
-    if not lazy:
-        fitted = fitted.compute()
-    parts = [fitted[..., i] for i in range(width)]
+    if here:
+        fitted = block(*cells)
+    else:
+        width = len(TERMS) * 4 + 2 + chosen.size
+        lazy = isinstance(cells[0], da.Array)
+        whole = [cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1)) for cell in cells]
+        fitted = da.map_blocks(block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64)
+        if not lazy:
+            fitted = fitted.compute()
     n = len(TERMS)
-    out = _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)))
-    out["fit_chi2"] = (("axis", "time"), parts[4 * n], attributes("fit_chi2"))
-    out["fit_dof"] = (("axis", "time"), parts[4 * n + 1], attributes("fit_dof"))
+    parts = [fitted[..., i] for i in range(4 * n + 2)]
+    extra: dict[str, Any] = {
+        "fit_chi2": (("axis", "time"), parts[4 * n], attributes("fit_chi2")),
+        "fit_dof": (("axis", "time"), parts[4 * n + 1], attributes("fit_dof")),
+    }
     if chosen.size == surface.sizes["tau"]:  # otherwise davar's own, for every averaging time, stands
-        out["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
-    out.attrs["fit_method"] = "gls"
-    return out
+        extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
+    return _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra, method="gls")
 
 
 class _Tables:
@@ -162,6 +208,7 @@ class _Tables:
         own = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
         #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp has no scatter of its own.
         self.own_dof = np.vstack([2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)])
+        self.ks = ks.astype(np.float64)
         self.quantile = _quantile_curve()
 
 
@@ -194,6 +241,7 @@ def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -
     result, misfit, dof = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
     square, error = field["square"], field["square_stderr"]
+    fails = _widen(field, misfit)
     with np.errstate(invalid="ignore", divide="ignore"):
         value = np.sqrt(square)
         # d(sqrt s) = ds / (2 sqrt s); near zero the root itself of the error of the square is the scale
@@ -201,11 +249,25 @@ def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -
         visible = np.isfinite(square) & (field["separation"] > _SEPARATION)
         observed = visible & (square > 0) & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
         limit = np.minimum(_limit_of_estimate(field, tables), _limit_of_cell(flat, square, dof, tables))
+        limit[fails] = _limit_of_curve([cell[fails] for cell in flat], square[fails], dof[fails], tables)
+        observed &= ~fails[:, None] | (square <= limit)
         upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
+        stderr = np.where(fails[:, None] & ~observed, np.fmax(stderr, (upper - value) / _LIMIT), stderr)
     stderr = np.where(visible, stderr, np.nan)
     value = np.where(visible, value, np.nan)
     observable = np.where(observed, 2.0, np.where(visible & np.isfinite(upper), 1.0, 0.0))
     return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
+
+
+def _widen(field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Say which windows the model does not fit, and multiply their variances in `field` by chi-square over its degrees of freedom."""
+    chi2, dof = misfit.T
+    fails = (dof > 0) & (gammaincc(np.maximum(dof, 1.0) / 2.0, np.nan_to_num(chi2) / 2.0) < _MISFIT)
+    wider = np.where(fails, chi2 / np.maximum(dof, 1.0), 1.0)[:, None]
+    field["square_stderr"] *= np.sqrt(wider)
+    for name in ("variance_null", "variance_linear", "variance_square"):
+        field[name] *= wider
+    return np.asarray(fails)
 
 
 def _limit_of_estimate(field: dict[str, NDArray[np.float64]], tables: _Tables) -> NDArray[np.float64]:
@@ -227,13 +289,38 @@ def _limit_of_cell(
     flat: list[NDArray[np.float64]], square: NDArray[np.float64], dof: NDArray[np.float64], tables: _Tables
 ) -> NDArray[np.float64]:
     """95 % upper limit of a squared coefficient from the one cell that can bound it best."""
-    limits = cell_limits(*flat, np.ascontiguousarray(square), dof, tables.columns, tables.own_dof, _MOST_FREEDOM, *tables.quantile)
-    return np.asarray(limits)
+    span = np.full(len(TERMS), np.inf)
+    square = np.ascontiguousarray(square)
+    return np.asarray(cell_limits(*flat, square, dof, tables.columns, tables.own_dof, tables.ks, span, _MOST_FREEDOM, *tables.quantile))
 
 
-def _assemble(surface: xr.Dataset, values: list[Any], errors: list[Any], limits: list[Any], observable: list[Any]) -> xr.Dataset:
+def _limit_of_curve(
+    flat: list[NDArray[np.float64]], square: NDArray[np.float64], dof: NDArray[np.float64], tables: _Tables
+) -> NDArray[np.float64]:
+    """95 % upper limit of a squared coefficient that needs no model: its part of the curve cannot be more than the whole.
+
+    What else is in a cell, noise or not, only adds to it. What takes away is a filter, or an alias that looks like a
+    filtered noise, and that bends the curve at short averaging times; so the cells are those of the last decade.
+    Quantization, which is what the shortest times tell, is bounded by all. A ramp is given the scatter of the noise that scatters most.
+    """
+    span = np.array([np.inf, *[_DECADE] * (len(TERMS) - 1)])
+    own_dof = np.vstack([tables.own_dof[:STOCHASTIC], tables.own_dof[:STOCHASTIC].min(axis=0)])
+    square = np.ascontiguousarray(square)
+    return np.asarray(cell_limits(*flat, square, dof, tables.columns, own_dof, tables.ks, span, _MOST_FREEDOM, *tables.quantile))
+
+
+def _assemble(
+    surface: xr.Dataset,
+    values: list[Any],
+    errors: list[Any],
+    limits: list[Any],
+    observable: list[Any],
+    extra: dict[str, Any],
+    *,
+    method: str,
+) -> xr.Dataset:
     plane = ("axis", "time")
-    out = surface.copy()
+    out: dict[str, Any] = {}
     for symbol, value, error, limit in zip(TERMS, values, errors, limits, strict=True):
         out[symbol] = (plane, value, attributes(symbol))
         out[f"{symbol}_stderr"] = (plane, error, attributes(f"{symbol}_stderr"))
@@ -242,7 +329,8 @@ def _assemble(surface: xr.Dataset, values: list[Any], errors: list[Any], limits:
             out[f"{symbol}_squared"] = (plane, value**2, attributes(f"{symbol}_squared"))
     stack = da.stack if isinstance(observable[0], da.Array) else np.stack
     out["observable"] = ((*plane, "term"), stack(observable, axis=-1).astype(np.int8), attributes("observable"))
-    return out.assign_coords(term=("term", list(TERMS), attributes("term")))
+    product = surface.assign({**out, **extra}).assign_coords(term=("term", list(TERMS), attributes("term")))
+    return product.assign_attrs(fit_method=method)
 
 
 _SQUARED = ("N_squared", "K_squared")
@@ -262,8 +350,6 @@ def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64])
             values[where][members] = np.abs(solution / scale)
     nothing = [np.full(deviation.shape[:2], np.nan) for _ in LAWS]
     seen = [np.where(np.isfinite(values[..., i]), 2, 0) for i in range(len(TERMS))]
-    out = _assemble(surface, [values[..., i] for i in range(len(TERMS))], nothing, nothing, seen)
-    out["fit_chi2"] = (("axis", "time"), nothing[0], attributes("fit_chi2"))
-    out["fit_dof"] = (("axis", "time"), nothing[0], attributes("fit_dof"))
-    out.attrs["fit_method"] = "adev"
-    return out
+    extra = {name: (("axis", "time"), nothing[0], attributes(name)) for name in ("fit_chi2", "fit_dof")}
+    coefficients = [values[..., i] for i in range(len(TERMS))]
+    return _assemble(surface, coefficients, nothing, nothing, seen, extra, method="adev")

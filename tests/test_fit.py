@@ -160,6 +160,57 @@ def test_what_is_not_there_is_rarely_claimed_and_its_limit_holds(share):
     assert float((product.B_upper >= 0.4).where(limited).mean()) >= 0.95
 
 
+def folded(rng, trials, n, *, N):
+    """White noise of N up to a quarter of the sampling rate and none above, as an alias or a filter leaves it."""
+    spectrum = np.fft.rfft(white(rng, trials, n, N=N, rate=RATE))
+    spectrum[:, np.fft.rfftfreq(n) > 0.25] = 0.0
+    return np.fft.irfft(spectrum, n)
+
+
+def test_limits_hold_where_the_five_terms_do_not_fit():
+    """Noise that is white below half of the band only: the five terms call it B, and from the fit alone N would be excluded."""
+    rng = np.random.default_rng(21)
+    product = fit_noise(windows_of(folded(rng, 600, 2000, N=0.01), taus=30))
+    assert float((product.fit_chi2 / product.fit_dof).median()) > 10
+    limited = product.observable == OBSERVABLE.index("upper_limit_only")
+    assert (limited.mean(("axis", "time")) > 0.99).all()
+    assert float((product.N_upper >= 0.01).where(limited.sel(term="N"), True).mean()) >= 0.94
+    assert float(product.N_upper.median()) < 0.02
+    for term in "QNBKR":
+        reach = product[term] + 1.6449 * product[f"{term}_stderr"]
+        assert (reach >= product[f"{term}_upper"] * (1 - 1e-9)).where(limited.sel(term=term), True).all()
+
+
+def test_what_is_added_to_the_noise_leaves_the_limits_high_enough():
+    """A tone in the middle of the averaging times: no term that is there may be excluded, seen or not."""
+    rng = np.random.default_rng(22)
+    t = np.arange(2000) / RATE
+    tone = 60.0 * np.sin(2 * np.pi * 1.3 * t + rng.uniform(0, 2 * np.pi, (600, 1)))
+    product = fit_noise(windows_of(white(rng, 600, 2000, N=0.01, rate=RATE) + flicker(rng, 600, 2000, B=0.4) + tone, taus=30))
+    assert (product.fit_chi2 > 2 * product.fit_dof).mean() > 0.95
+    for term, value in (("N", 0.01), ("B", 0.4)):
+        limited = product.observable.sel(term=term) == OBSERVABLE.index("upper_limit_only")
+        assert limited.sum() > 100
+        assert float((product[f"{term}_upper"] >= value).where(limited).mean()) >= 0.95, term
+
+
+def test_errors_widen_with_the_misfit_and_only_then():
+    rng = np.random.default_rng(23)
+    surface = windows_of(white(rng, 40, 2000, N=0.01, rate=RATE), taus=20)
+    spoiled = surface.assign(avar=surface.avar * (1 + 0.2 * (np.arange(surface.sizes["tau"]) % 2)))
+    for cells, fits in ((surface, True), (spoiled, False)):
+        product = fit_noise(cells, terms="N")
+        flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in fit._inputs(cells)[0]]
+        ks = np.round(cells.tau.values * RATE).astype(np.int64)
+        tables = fit._tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2000)
+        result, misfit, _ = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 2)
+        fails = chi2.sf(misfit[:, 0], misfit[:, 1]) < 1e-3
+        assert fails.mean() < 0.06 if fits else fails.all()
+        scale = np.where(fails, np.sqrt(misfit[:, 0] / misfit[:, 1]), 1.0)
+        expected = result[:, FIT_FIELDS.index("square_stderr"), 1] * scale / (2 * np.sqrt(result[:, 0, 1]))
+        np.testing.assert_allclose(product.N_stderr[0], expected, rtol=1e-9)
+
+
 def test_a_pure_ramp_is_r():
     t = np.arange(20_000) / RATE / 3600
     x = 36.0 * t + 1e-3 * np.random.default_rng(8).standard_normal(20_000)

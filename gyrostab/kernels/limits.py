@@ -59,7 +59,7 @@ def _see(columns, white, quantization, squares, seen):  # type: ignore[no-untype
 
 
 @njit(**KERNEL)
-def cell_limits(avar, white, quantization, factor, squares, dof, columns, own_dof, most, start, step, curve):  # type: ignore[no-untyped-def]
+def cell_limits(avar, white, quantization, factor, squares, dof, columns, own_dof, ks, span, most, start, step, curve):  # type: ignore[no-untyped-def]
     """Upper limit of each squared coefficient from one cell, which cannot be less than the term's own part of it.
 
     The cell is the one where the fitted model promises the lowest limit, so that its own scatter does not choose it.
@@ -74,6 +74,10 @@ def cell_limits(avar, white, quantization, factor, squares, dof, columns, own_do
         Allan variance per squared coefficient.
     own_dof : float64 (5, n_tau)
         Degrees of freedom of a cell in which a term is alone; infinite for a ramp, which is bounded by `dof`.
+    ks : float64 (n_tau,)
+        Averaging factors, rising.
+    span : float64 (5,)
+        A cell may bound a term if the longest averaging factor of its window is at most so many times its own.
     most : float
         Degrees of freedom are not taken above this.
     start, step, curve
@@ -92,12 +96,17 @@ def cell_limits(avar, white, quantization, factor, squares, dof, columns, own_do
             whole[i, a] = _quantile(min(own_dof[a, i], most), start, step, curve)
     for w in range(n_windows):
         lowest[:] = np.inf
+        last = n_tau - 1
+        while last > 0 and not np.isfinite(avar[w, last]):
+            last -= 1
         for i in range(n_tau):
             if not np.isfinite(avar[w, i]):
                 continue
             model = _see(columns[i], white[w, i], quantization[w, i], squares[w], seen)
             share = factor[w, i]
             for a in range(5):
+                if ks[i] * span[a] < ks[last]:
+                    continue
                 quantile = whole[i, a]
                 if a == 4:
                     quantile = _quantile(min(own_dof[a, i] * share, most, dof[w, i]), start, step, curve)
