@@ -153,7 +153,10 @@ class GaussMarkov(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """The spectrum of the samples."""
         density = lorentz_density(windows.frequency, self.correlation_time, windows.rate)
-        return Prediction(spectrum={"rms": np.broadcast_to(density, (windows.begin.size, density.size))})
+        return Prediction(
+            spectrum={"rms": np.broadcast_to(density, (windows.begin.size, density.size))},
+            wander={"rms": (self.correlation_time, np.ones(windows.begin.size))},
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -201,7 +204,7 @@ class Clipping(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Nothing in means and spectra that is linear in the limit: it shows in the distribution."""
-        return Prediction()
+        return Prediction(marks=("extremes",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

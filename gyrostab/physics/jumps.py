@@ -226,7 +226,10 @@ class Telegraph(Effect):
         """The spectrum of the samples."""
         share = self.high / (self.low + self.high)
         density = share * (1.0 - share) * lorentz_density(windows.frequency, self.correlation_time, windows.rate)
-        return Prediction(spectrum={"step": np.broadcast_to(density, (windows.begin.size, density.size))})
+        return Prediction(
+            spectrum={"step": np.broadcast_to(density, (windows.begin.size, density.size))},
+            wander={"step": (self.correlation_time, np.full(windows.begin.size, share * (1.0 - share)))},
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

@@ -180,7 +180,8 @@ class RotationLine(Effect):
         place = fold(cycles, windows.rate)
         power = 0.5 * (k**-self.rolloff * np.sinc(cycles / windows.rate)) ** 2
         comb = sum((line_density(windows, one, weight) for one, weight in zip(place, power, strict=True)), np.zeros(()))
-        return Prediction(mean={"amplitude": mean}, spectrum={"amplitude": comb}, line=place)
+        order = {"amplitude": np.ones((len(windows.axes), 3), np.complex128)}
+        return Prediction(mean={"amplitude": mean}, spectrum={"amplitude": comb}, line=place, order=order)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

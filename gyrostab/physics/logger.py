@@ -178,7 +178,7 @@ class RateQuantization(Effect):
         """White noise of step^2 / 12 in every sample; half a step less on average where the value below is taken."""
         white = np.full((windows.begin.size, windows.frequency.size), 1.0 / (12.0 * windows.rate))
         mean = {"step": np.full(windows.begin.size, -0.5)} if self.mode == "floor" else {}
-        return Prediction(mean=mean, spectrum={"step": white})
+        return Prediction(mean=mean, spectrum={"step": white}, marks=("lattice",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -258,7 +258,7 @@ class Spikes(Effect):
         bits = int(self.bits)
         name, square = ("size", 1.0) if self.kind == "outlier" else ("lsb", (4.0**bits - 1.0) / (3.0 * bits))
         white = np.full((windows.begin.size, windows.frequency.size), self._chance(windows.rate) * square / windows.rate)
-        return Prediction(spectrum={name: white})
+        return Prediction(spectrum={name: white}, marks=("outliers",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -338,9 +338,9 @@ class HeldSamples(Effect):
         if self.fill == "zero":
             share = count / windows.rate / _HOUR
             own = np.stack([windows.own[axis] for axis in windows.axes])
-            return Prediction(mean={"per_hour": -share * own})
+            return Prediction(mean={"per_hour": -share * own}, marks=("zeros",))
         growth = 2.0 * count**2 / (_HOUR * windows.rate)
-        return Prediction(level={("N", "per_hour"): np.full(windows.begin.size, growth)})
+        return Prediction(level={("N", "per_hour"): np.full(windows.begin.size, growth)}, marks=("repeats",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

@@ -276,7 +276,7 @@ class VibrationRandomWalk(Effect):
         excited = _excited(windows.drivers["vibration"], self.exponent)[:, None]
         cycles = 2.0 * math.pi * windows.frequency / windows.rate
         walk = (2.0 + np.cos(cycles)) / (6.0 * (1.0 - np.cos(cycles))) / (HOUR * windows.rate**2)
-        return Prediction(spectrum={"sensitivity": excited * walk})
+        return Prediction(spectrum={"sensitivity": excited * walk}, wander={"sensitivity": (math.inf, excited[:, 0] / HOUR)})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

@@ -79,7 +79,7 @@ class DeadZone(Effect):
         """Window means: less by the width on both sides; nothing is known inside."""
         away = np.stack([windows.own[axis] for axis in windows.axes]) - self.centre
         outside = np.sign(away) * (np.abs(away) > 0.05 * self.width)
-        return Prediction(mean={"width": -outside * (self.edge == "offset")})
+        return Prediction(mean={"width": -outside * (self.edge == "offset")}, marks=("zeros",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -205,7 +205,21 @@ class FeedbackReset(Effect):
             name: sum((line_density(windows, *line) for line in zip(place, strength, strict=True)), np.zeros(()))
             for name, strength in power.items()
         }
-        return Prediction(mean={"kick": resets, "tail": resets}, spectrum=spectrum, line=place)
+        return Prediction(mean={"kick": resets, "tail": resets}, spectrum=spectrum, line=place, phase_locked=self._profiles(windows))
+
+    def _profiles(self, windows: Windows) -> dict[str, Array]:
+        """Error by phase of the ramp at the end of the sample: that sample holds the kick which the ramp passed its foot in."""
+        if not windows.phase.size:
+            return {}
+        own = np.stack([windows.own[axis] for axis in windows.axes])
+        moved = np.nanmedian(own) / (self.turn * _NRAD_PER_S * windows.rate)
+        step = max(abs(moved), 1.0 / windows.phase.size)
+        since = windows.phase if moved * self.full >= 0 else 1.0 - windows.phase
+        kick = (since < step) * (_NRAD_PER_S * windows.rate) * np.sign(moved)
+        seconds = since / max(abs(moved), 1e-9) / windows.rate
+        cycle = 1.0 / max(abs(moved), 1e-9) / windows.rate / self.decay
+        tail = np.exp(-seconds / self.decay) / self.decay / -np.expm1(-cycle) * _NRAD_PER_S * np.sign(moved)
+        return {"kick": kick, "tail": tail, "sawtooth": 1.0 - 2.0 * windows.phase}
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

@@ -33,6 +33,8 @@ class Windows:
         Measured rate of every axis of the log, averaged over each window [degree hour-1].
     gaps, restarts : ndarray, shape (n, 2)
         As in `Setup`, in seconds.
+    phase : ndarray, shape (phase,)
+        Centres of the bins of the ramp's phase, from 0 to 1; empty where no ramp was recorded.
     """
 
     begin: Array
@@ -44,6 +46,7 @@ class Windows:
     own: Mapping[str, Array] = field(default_factory=dict)
     gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
     restarts: Array = field(default_factory=lambda: np.empty((0, 2)))
+    phase: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def centre(self) -> Array:
@@ -72,6 +75,19 @@ class Prediction:
         The added spectrum is one process on all axes: it fills the cross-spectra too, with one factor (and sign) per axis.
     line : ndarray, shape (window,) or (harmonic, window), or None
         Frequency of a line in every window [Hz], folded below half of the sampling rate.
+    marks : tuple of str
+        What it raises in the distribution of the samples: outliers, repeats, extremes, zeros, lattice.
+    transfer : mapping of (str, str) to complex ndarray, shape (band,)
+        (parameter, channel) -> transfer function from the channel to the rate, per unit [degree hour-1 per unit of the channel]. The
+        name of an axis in place of a channel stands for the rate of that axis.
+    order : mapping of str to complex ndarray, shape (axis, harmonic)
+        Parameter -> pattern of the harmonics of the rotation over axes, up to one complex factor (size and phase); where the
+        parameter is one number for each axis, every axis and harmonic has a factor of its own.
+    phase_locked : mapping of str to ndarray, shape (phase,)
+        Parameter -> mean by phase of the ramp, per unit [degree hour-1 per unit].
+    wander : mapping of str to (float, ndarray of shape (window,))
+        Parameter -> a random mean: time constant of its memory [s], inf for a walk; and per squared unit its variance
+        [degree2 hour-2], for a walk the growth of its variance [degree2 hour-2 s-1], in every window.
     """
 
     mean: Mapping[str, Array] = field(default_factory=dict)
@@ -80,3 +96,8 @@ class Prediction:
     response: Array | None = None
     coherent: bool = False
     line: Array | None = None
+    marks: tuple[str, ...] = ()
+    transfer: Mapping[tuple[str, str], NDArray[np.complex128]] = field(default_factory=dict)
+    order: Mapping[str, NDArray[np.complex128]] = field(default_factory=dict)
+    phase_locked: Mapping[str, Array] = field(default_factory=dict)
+    wander: Mapping[str, tuple[float, Array]] = field(default_factory=dict)

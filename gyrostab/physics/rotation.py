@@ -149,7 +149,8 @@ class Misalignment(Effect):
         for source in self.size_parameters:
             if source in windows.own and any(axis != source for axis in windows.axes):
                 mean[source] = np.stack([_MRAD * windows.own[source] * (axis != source) for axis in windows.axes])
-        return Prediction(mean=mean)
+        flat = np.full(windows.frequency.size, _MRAD, np.complex128)
+        return Prediction(mean=mean, transfer={(source, source): flat for source in mean})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -246,7 +247,15 @@ class EarthRate(Effect):
         """Window means, and where the line shows."""
         rotation = windows.drivers["rotation_rate"]
         seen = self._seen(*turns_of_windows(windows, rotation), windows.axes)
-        return Prediction(mean={"rate": seen / self.rate if self.rate else 0.0 * seen}, line=fold(np.abs(rotation) / TURN, windows.rate))
+        off, around = self._directions(windows.axes)
+        across = math.hypot(*self.components()[1:]) / self.rate if self.rate else 0.0
+        pattern = np.zeros((len(windows.axes), 3), np.complex128)
+        pattern[:, 0] = across * np.sin(off) * np.exp(1j * around)
+        return Prediction(
+            mean={"rate": seen / self.rate if self.rate else 0.0 * seen},
+            line=fold(np.abs(rotation) / TURN, windows.rate),
+            order={"rate": pattern},
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -355,7 +364,11 @@ class RealMotion(Effect):
 
         highest = self.frequency * (1.0 + 20.0 / self.quality)
         folded = folded_psd(density, windows.frequency, windows.rate, highest, average=True)
-        return Prediction(mean=mean, spectrum={"sway": np.broadcast_to(folded, (windows.begin.size, folded.size))}, coherent=True)
+        sway = np.broadcast_to(folded, (windows.begin.size, folded.size))
+        place = np.full(windows.begin.size, float(fold(self.frequency, windows.rate)))
+        turning = np.asarray(2j * np.pi * windows.frequency * (math.degrees(_MRAD) * _HOUR))
+        transfer = {(name, f"accel_{name}"): turning for name in "xyz"}
+        return Prediction(mean=mean, spectrum={"sway": sway}, coherent=True, line=place, transfer=transfer)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -74,6 +74,11 @@ class GSensitivity(_Vector):
     x: float = parameter("deg/h/g", "bias per g along x", default=0.0, typical=1e-3, low=-10.0, high=10.0)
     y: float = parameter("deg/h/g", "bias per g along y", default=0.0, typical=1e-3, low=-10.0, high=10.0)
     z: float = parameter("deg/h/g", "bias per g along z", default=0.0, typical=1e-3, low=-10.0, high=10.0)
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Window means: the components that there are; and the same factor at every frequency."""
+        flat = np.ones(windows.frequency.size, np.complex128)
+        return replace(super().explain(windows), transfer={(name[-1], name): flat for name in self.channels})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
