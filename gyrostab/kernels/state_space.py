@@ -19,8 +19,10 @@ Array = NDArray[np.float64]
 
 @njit(**INNER)
 def _moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared):  # type: ignore[no-untyped-def]
-    """Fill in, for a block of `step` seconds: how each state goes on, its weight in the mean, the variance of what is new at the end,
-    and the covariance of that with the mean; returns the variance of the mean when the states at the start are known.
+    """Variance of the mean over a block of `step` seconds when the states at its start are known.
+
+    Fills in how each state goes on, its weight in the mean, the variance of what is new at the end, and the covariance of that with
+    the mean.
     """
     decay[0], weight[0], drive[0], shared[0] = 1.0, 1.0, K2 * step, K2 * step / 2.0
     rest = K2 * step / 3.0
@@ -45,6 +47,25 @@ def _advance(covariance, decay, drive):  # type: ignore[no-untyped-def]
         for j in range(m):
             covariance[i, j] *= decay[i] * decay[j]
         covariance[i, i] += drive[i]
+
+
+@njit(**INNER)
+def _project(covariance, weight, first, gain):  # type: ignore[no-untyped-def]
+    """Covariances of the states with the mean to `gain`; returns the mean's variance. Both over the states from `first` on."""
+    total = 0.0
+    for j in range(first, weight.size):
+        gain[j] = 0.0
+        for k in range(first, weight.size):
+            gain[j] += covariance[j, k] * weight[k]
+        total += gain[j] * weight[j]
+    return total
+
+
+@njit(**INNER)
+def _subtract(covariance, gain, F):  # type: ignore[no-untyped-def]
+    for j in range(gain.size):
+        for k in range(gain.size):
+            covariance[j, k] -= gain[j] * gain[k] * F
 
 
 @njit(fastmath={"contract"}, **INNER)
@@ -120,12 +141,7 @@ def whiten(
                     state[j, c] *= decay[j]
             _advance(covariance, decay, drive)
             continue
-        F = variance[i] + rest  # of the innovation; without the level, where that is not known yet
-        for j in range(0 if known else 1, m):
-            gain[j] = 0.0
-            for k in range(0 if known else 1, m):
-                gain[j] += covariance[j, k] * weight[k]
-            F += gain[j] * weight[j]
+        F = variance[i] + rest + _project(covariance, weight, 0 if known else 1, gain)  # of the innovation; the level counts once known
         if not known:  # the level becomes what the mean says, with the error of all the rest
             known = True
             _advance(covariance, decay, drive)
@@ -138,8 +154,6 @@ def whiten(
             gain[j] = (decay[j] * gain[j] + shared[j]) / F
         _innovations(columns[i], state, weight, decay, gain, 1.0 / np.sqrt(F), out[i])
         _advance(covariance, decay, drive)
-        for j in range(m):
-            for k in range(m):
-                covariance[j, k] -= gain[j] * gain[k] * F
+        _subtract(covariance, gain, F)
         total += np.log(F)
     return out, total
