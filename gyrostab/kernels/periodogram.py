@@ -1,0 +1,268 @@
+"""Periodograms of blocks with missing samples, averaged over bands, and what the samples of a block tell beside their spectrum.
+
+A block of L samples y with the mask m (1 where present) and the taper w has the ordinates
+
+    F_k = sum_i w_i m_i (y_i - mean) exp(-2 pi j k i / L),    k = 1 ... ceil(L / 2) - 1.
+
+With a = w m, A = FFT(a), V = FFT(a^2) and n samples present, white noise of variance s has exactly
+
+    E |F_k|^2 = s (V_0 - |A_k|^2 / n),    cov(F_k, F_l) = s (V_(k-l) - A_k conj(A_l) / n),
+
+and E F_k F_l follows with -l for l. So the power of a band, the sum of |F_k|^2 over the sum of their expectations, is unbiased with
+any gaps, and its variance gives the shape of the gamma distribution that it follows.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import INNER, KERNEL
+
+__all__ = [
+    "HISTOGRAM",
+    "band_edges",
+    "band_powers",
+    "block_samples",
+    "gap_spectra",
+    "histogram_edge",
+    "ordinates",
+    "phase_profile",
+    "shape_of_bands",
+    "taper",
+]
+
+Array = NDArray[np.float64]
+
+#: Bins of the histogram of second differences: one for zero, then four an octave from 2**-32 to 2**32.
+HISTOGRAM = 256
+_EXACT = 12  # ordinates of a band up to which the covariance of each pair is summed
+
+
+def taper(size: int, share: float = 0.2) -> Array:
+    """Tukey's taper: cosine slopes on `share` of the samples, half of them at either end, and 1 between.
+
+    Examples
+    --------
+    >>> taper(10, 0.4).round(2)
+    array([0.15, 0.85, 1.  , 1.  , 1.  , 1.  , 1.  , 1.  , 0.85, 0.15])
+    """
+    middle = (np.arange(size) + 0.5) / size
+    inside = np.minimum(middle, 1.0 - middle) / (share / 2.0)
+    return np.asarray(np.where(inside < 1.0, 0.5 - 0.5 * np.cos(math.pi * np.minimum(inside, 1.0)), 1.0))
+
+
+def ordinates(size: int) -> int:
+    """Complex ordinates of a real block of `size` samples: without frequency 0 and without half of the sampling rate."""
+    return (size + 1) // 2 - 1
+
+
+def band_edges(size: int, bands: int = 16) -> NDArray[np.int64]:
+    """First ordinate of about `bands` bands, evenly spaced in log frequency, and one past the last ordinate.
+
+    Examples
+    --------
+    >>> band_edges(2000)
+    array([   1,    2,    4,    6,    9,   13,   21,   32,   49,   75,  115,
+            178,  274,  422,  649, 1000])
+    """
+    top = ordinates(size) + 1
+    return np.unique(np.round(np.geomspace(1, top, bands + 1)).astype(np.int64))
+
+
+@njit(**INNER)
+def _bin(value):  # type: ignore[no-untyped-def]
+    if value == 0.0:
+        return np.int64(0)
+    return np.int64(min(max(4.0 * math.log2(value) + 128.0, 1.0), 255.0))
+
+
+def histogram_edge(number: Any) -> Array:
+    """Lower edge of bin `number` of the histogram of second differences; fractions of a bin are allowed."""
+    return np.asarray(np.exp2((np.asarray(number, np.float64) - 128.0) / 4.0))
+
+
+@njit(**KERNEL)
+def block_samples(x, centred, moments, counts, histogram):  # type: ignore[no-untyped-def]
+    """What the samples of each block tell, in one pass.
+
+    Parameters
+    ----------
+    x : ndarray, shape (block, sample)
+        Values, NaN where missing.
+    centred : ndarray, shape (block, sample)
+        Is filled with the values less their block's mean, 0 where missing.
+    moments : ndarray, shape (block, 5)
+        Is filled with mean, second and fourth central moment, smallest and largest value; NaN in an empty block.
+    counts : ndarray of int64, shape (block, 5)
+        Is filled with the samples present, exact zeros, samples equal to the one before, and samples equal to the smallest and to
+        the largest value of the block.
+    histogram : ndarray of uint32, shape (block, `HISTOGRAM`) or (0, 0)
+        Is filled with the number of second differences by size, unless it is empty.
+    """
+    size = x.shape[1]
+    for b in range(x.shape[0]):
+        row = x[b]
+        first, low, high, total = np.nan, np.inf, -np.inf, 0.0
+        present, zeros, repeats = 0, 0, 0
+        for i in range(size):
+            value = row[i]
+            if value != value:
+                continue
+            if present == 0:
+                first = value
+            present += 1
+            total += value - first
+            zeros += value == 0.0
+            repeats += i > 0 and value == row[i - 1]
+            low, high = min(low, value), max(high, value)
+        mean = first + total / max(present, 1)
+        second, fourth = 0.0, 0.0
+        lows, highs = 0, 0
+        for i in range(size):
+            value = row[i]
+            if value != value:
+                centred[b, i] = 0.0
+                continue
+            square = (value - mean) ** 2
+            second += square
+            fourth += square * square
+            centred[b, i] = value - mean
+            lows += value == low
+            highs += value == high
+        if histogram.shape[0] > 0:
+            for i in range(2, size):
+                difference = abs(row[i] - row[i - 1] - row[i - 1] + row[i - 2])
+                if difference == difference:
+                    histogram[b, _bin(difference)] += np.uint32(1)
+        counts[b, 0], counts[b, 1], counts[b, 2], counts[b, 3], counts[b, 4] = present, zeros, repeats, lows, highs
+        moments[b, 0], moments[b, 1], moments[b, 2] = mean, second / max(present, 1), fourth / max(present, 1)
+        moments[b, 3], moments[b, 4] = low, high
+        if present == 0:
+            moments[b, :] = np.nan
+
+
+def gap_spectra(present: NDArray[np.bool_], weights: Array) -> tuple[Array, NDArray[np.complex128], NDArray[np.complex128]]:
+    """Expected power of each ordinate in white noise, and the spectra of the mask that it comes from.
+
+    Parameters
+    ----------
+    present : ndarray of bool, shape (block, sample)
+        Where there are samples; at least one in each block.
+    weights : ndarray, shape (sample,)
+        The taper.
+
+    Returns
+    -------
+    expected : ndarray, shape (block, ordinate)
+        ``E |F_k|^2`` for unit variance.
+    mask, squared : ndarray of complex, shape (block, size // 2 + 1)
+        Spectra of ``w m`` and of ``(w m)^2``.
+    """
+    tapered = present * weights
+    mask = np.fft.rfft(tapered, axis=-1)
+    squared = np.fft.rfft(tapered**2, axis=-1)
+    inside = mask[:, 1 : ordinates(weights.size) + 1]
+    lost = (inside.real**2 + inside.imag**2) / present.sum(axis=-1)[:, None]
+    return squared[:, :1].real - lost, mask, squared
+
+
+@njit(**INNER)
+def _squared_at(squared, b, place, size):  # type: ignore[no-untyped-def]
+    """Value of the Hermitian spectrum of ``(w m)^2`` at any place."""
+    place = abs(place)
+    if place > size // 2:
+        return np.conj(squared[b, size - place])
+    return squared[b, place]
+
+
+@njit(**KERNEL)
+def shape_of_bands(mask, squared, expected, present, edges, size):  # type: ignore[no-untyped-def]
+    """Shape of the gamma distribution of each block's band powers in white noise, (block, band).
+
+    Parameters
+    ----------
+    mask, squared, expected : ndarray
+        From `gap_spectra`.
+    present : ndarray of int64, shape (block,)
+        Samples present.
+    edges : ndarray of int64
+        From `band_edges`.
+    size : int
+        Samples of a block.
+    """
+    out = np.empty((mask.shape[0], edges.size - 1))
+    for b in range(mask.shape[0]):
+        for band in range(edges.size - 1):
+            first, stop = edges[band], edges[band + 1]
+            mean, variance = 0.0, 0.0
+            for k in range(first, stop):
+                mean += expected[b, k - 1]
+            if stop - first <= _EXACT:
+                for k in range(first, stop):
+                    for other in range(first, stop):
+                        share = mask[b, k] / present[b]
+                        back = np.conj(mask[b, other])
+                        at = np.conj(_squared_at(squared, b, k - other, size)) if k < other else _squared_at(squared, b, k - other, size)
+                        one = at - share * back
+                        two = _squared_at(squared, b, k + other, size) - share * mask[b, other]
+                        variance += one.real**2 + one.imag**2 + two.real**2 + two.imag**2
+            else:
+                for apart in range(stop - first):
+                    power = squared[b, apart].real ** 2 + squared[b, apart].imag ** 2
+                    variance += (1.0 if apart == 0 else 2.0) * (stop - first - apart) * power
+            out[b, band] = mean * mean / variance if variance > 0.0 else np.nan
+    return out
+
+
+@njit(**KERNEL)
+def band_powers(one, other, expected, place, edges, rate):  # type: ignore[no-untyped-def]
+    """Mean cross-periodogram of each block and band, as a two-sided density, (block, band) complex.
+
+    Parameters
+    ----------
+    one, other : ndarray of complex, shape (block, ordinate)
+        Ordinates of two signals (or of one, twice) with the same mask.
+    expected : ndarray, shape (mask, ordinate)
+        Expected powers, from `gap_spectra`, of the masks that occur.
+    place : ndarray of int64, shape (block,)
+        Which of the masks each block has.
+    edges : ndarray of int64
+        From `band_edges`.
+    rate : float
+        Sampling rate [Hz].
+    """
+    out = np.empty((one.shape[0], edges.size - 1), np.complex128)
+    for b in range(one.shape[0]):
+        for band in range(edges.size - 1):
+            total, norm = 0.0 + 0.0j, 0.0
+            for k in range(edges[band] - 1, edges[band + 1] - 1):
+                total += one[b, k] * np.conj(other[b, k])
+                norm += expected[place[b], k]
+            out[b, band] = total / (norm * rate)
+    return out
+
+
+@njit(**KERNEL)
+def phase_profile(centred, present, phase, low, high, sums, counts):  # type: ignore[no-untyped-def]
+    """Sum of the centred values, and number of them, by block and by phase in equal bins from `low` to `high`; both are added to.
+
+    Parameters
+    ----------
+    centred, phase : ndarray, shape (block, sample)
+    present : ndarray of bool, shape (block, sample)
+    low, high : float
+    sums, counts : ndarray, shape (block, bin)
+    """
+    bins = sums.shape[1]
+    scale = bins / (high - low)
+    for b in range(centred.shape[0]):
+        for i in range(centred.shape[1]):
+            if present[b, i] and phase[b, i] == phase[b, i]:
+                at = min(max(np.int64((phase[b, i] - low) * scale), 0), bins - 1)
+                sums[b, at] += centred[b, i]
+                counts[b, at] += 1
