@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -22,6 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one process a core instead
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from page import renew
 
 import gyrostab
 from gyrostab.correlate.judge import VERDICTS
@@ -116,12 +116,7 @@ def main() -> None:
             text = "\n".join(table(pool.map, chosen.records))
             print(f"{name}\n{text}\n", flush=True)
             if chosen.output:
-                page = chosen.output.read_text(encoding="utf-8")
-                between = re.compile(f"(?<=<!-- {name} -->\n).*?(?=<!-- end of {name} -->)", re.DOTALL)
-                page, places = between.subn(lambda _, text=text: f"{text}\n", page)
-                if places != 1:
-                    raise SystemExit(f"{chosen.output}: put <!-- {name} --> and <!-- end of {name} --> where the table goes")
-                chosen.output.write_text(page, encoding="utf-8")
+                renew(chosen.output, name, text)
 
 
 if __name__ == "__main__":

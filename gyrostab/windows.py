@@ -16,8 +16,8 @@ __all__ = ["averaging_factors", "duration_seconds", "samples", "thin"]
 _SAMPLES = re.compile(r"^\s*(\d+)\s*samples?\s*$")
 
 
-def duration_seconds(value: Any, option: str) -> float:
-    """Seconds of a duration: a number [s], a timedelta, or a string such as ``"10min"`` or ``"0.1s"``.
+def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2h") -> float:
+    """Seconds of a duration: a number [s], a timedelta, or a string such as ``"10min"`` or ``"0.1s"``; a message names the examples.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def duration_seconds(value: Any, option: str) -> float:
         if isinstance(value, str):
             seconds = pd.Timedelta(re.sub(r"(?<=[\d ])m$", "min", value.strip())).value / 1e9
             if re.fullmatch(r"[\d.eE+-]+", value.strip()):
-                raise OptionError(f"{option} {value!r} has no unit; write for instance {value}s, {value}min or {value}samples")
+                raise OptionError(f"{option} {value!r} has no unit; write for instance {example}")
         elif isinstance(value, (int, float, np.number)):
             seconds = float(value)
         else:
@@ -41,7 +41,7 @@ def duration_seconds(value: Any, option: str) -> float:
     except OptionError:
         raise
     except (ValueError, TypeError) as error:
-        raise OptionError(f"{option} {value!r} is not a duration; write for instance 10min, 30s or 2000samples") from error
+        raise OptionError(f"{option} {value!r} is not a duration; write for instance {example}") from error
     if not (np.isfinite(seconds) and seconds > 0):
         raise OptionError(f"{option} {value!r} must be longer than zero")
     return float(seconds)
@@ -61,7 +61,7 @@ def samples(value: Any, rate: float, option: str) -> int:
         if count < 1:
             raise OptionError(f"{option} of {count} samples: give at least 1")
         return count
-    seconds = duration_seconds(value, option)
+    seconds = duration_seconds(value, option, example="10min, 30s or 2000samples")
     count = round(seconds * rate)
     if count < 1:
         raise OptionError(f"{option} {value!r} is shorter than one sample at {rate:g} Hz ({1 / rate:g} s)")

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 import gyrostab
-from gyrostab.errata import errata
 from gyrostab.plot.style import save_png
 
 ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
@@ -75,6 +74,6 @@ def fill(page, name, text):
 
 if __name__ == "__main__":
     page = ROOT / "docs" / "seeds.md"
-    for chosen in sys.argv[1:] or [*PLAN["experiment"], "errata"]:
-        made = lines(PLAN["errata"], errata()) if chosen == "errata" else experiment(chosen, page.parent / "figures")
+    for chosen in sys.argv[1:] or PLAN["experiment"]:
+        made = experiment(chosen, page.parent / "figures")
         page.write_text(fill(page.read_text(encoding="utf-8"), chosen, made), encoding="utf-8")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,21 +14,13 @@ from gyrostab.log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.plot import plot_comparison
 from tests.conftest import ROOT
+from tests.scripts import load_script
 
 PAGES = ROOT / "docs" / "physics"
 INDEX = (PAGES / "README.md").read_text(encoding="utf-8")
 
 
-def _script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("effect_figures", ROOT / "pipelines" / "effect_figures.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-SCRIPT = _script()
+SCRIPT = load_script("pipelines/effect_figures.py")
 
 
 def section(name: str) -> str:

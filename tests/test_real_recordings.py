@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,22 +16,13 @@ import xarray as xr
 import gyrostab
 from gyrostab.cli import main
 from gyrostab.units import parse_unit
+from tests.scripts import load_script
 
 pytestmark = pytest.mark.xdist_group("real_recordings")
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def _script() -> ModuleType:
-    path = ROOT / "pipelines" / "real_recordings.py"
-    spec = importlib.util.spec_from_file_location("real_recordings", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-SCRIPT = _script()
+SCRIPT = load_script("pipelines/real_recordings.py")
 ENTRIES: dict[str, Any] = SCRIPT.PLAN["recording"]
 Outcome = tuple[xr.Dataset, xr.Dataset, dict[str, float]]
 

@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import copy
-import importlib.util
 import math
 import re
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
-from gyrostab.errata import Erratum, errata
+from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "seeds.md"
 
 
-def _script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("seed_experiments", ROOT / "pipelines" / "seed_experiments.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-SCRIPT = _script()
+SCRIPT = load_script("pipelines/seed_experiments.py")
+ERRATA = load_script("benchmarks/seed_errata.py")
 
 
 def cells(text: str) -> dict[str, list[str]]:
@@ -52,8 +42,8 @@ def plan(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def slips() -> list[Erratum]:
-    return errata()
+def slips():
+    return ERRATA.errata()
 
 
 # ---------------------------------------------------------------------------------------------------------------- experiments

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from gyrostab.clock import time_of_day
-from gyrostab.errors import OptionError, TimeError, UnitError
+from gyrostab.errors import TimeError, UnitError
 from gyrostab.gaps import gap_variables, name_lost
 from gyrostab.join.channels import join_channels
 from gyrostab.join.gaps import join_gaps
@@ -23,6 +22,7 @@ from gyrostab.join.place import place_logs
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
 from gyrostab.store import common_packing
 from gyrostab.timegrid import grid_times, time_coordinate
+from gyrostab.windows import duration_seconds
 
 __all__ = ["join_logs", "log_span"]
 
@@ -74,7 +74,7 @@ def join_logs(
         check_log(log)
     sources = sorted((source_of(log, Path(path).name) for log, path in zip(logs, paths, strict=True)), key=lambda source: source.start)
     _check_same(sources)
-    pieces, notes = place_logs(sources, max_gap=_seconds(max_gap))
+    pieces, notes = place_logs(sources, max_gap=duration_seconds(max_gap, "max_gap"))
     rate = sources[0].rate
     start = int(grid_times(sources[0].start, rate, -pieces[0].first))
     size = max(piece.end for piece in pieces)
@@ -96,16 +96,6 @@ def join_logs(
 def _close(logs: Sequence[xr.Dataset]) -> None:
     for log in logs:
         log.close()
-
-
-def _seconds(max_gap: str | float) -> float:
-    try:
-        seconds = float(max_gap) if isinstance(max_gap, int | float) else pd.Timedelta(max_gap).total_seconds()
-    except ValueError as error:
-        raise OptionError(f"max_gap={max_gap!r} is not a duration; write for instance '10D', '2h' or '30min'") from error
-    if not seconds > 0:
-        raise OptionError(f"max_gap={max_gap!r} must be longer than nothing; write for instance '10D', '2h' or '30min'")
-    return seconds
 
 
 def _check_same(sources: Sequence[Source]) -> None:

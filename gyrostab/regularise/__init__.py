@@ -24,21 +24,12 @@ from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name
 from gyrostab.store import chunk_samples
 from gyrostab.timegrid import time_coordinate
+from gyrostab.windows import duration_seconds
 
 __all__ = ["gap_table", "regularise"]
 
 _DISAGREE = 0.02  # a declared rate further off than this is a mistake
 _OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "history", "unreadable_spans")
-
-
-def _seconds(max_gap: Any) -> float:
-    try:
-        seconds = float(max_gap) if isinstance(max_gap, int | float) else pd.Timedelta(max_gap).total_seconds()
-    except ValueError as error:
-        raise OptionError(f"max_gap={max_gap!r} is not a duration; write for instance '10D', '2h' or '30min'") from error
-    if not seconds > 0:
-        raise OptionError(f"max_gap={max_gap!r} must be longer than nothing; write for instance '10D', '2h' or '30min'")
-    return seconds
 
 
 def _checked(*, rate: float | None, tolerance: float, chunk: int | None, block: int) -> None:
@@ -192,7 +183,7 @@ def regularise(
         return raw
     check_raw(raw)
     _checked(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
-    gap_limit = _seconds(max_gap)
+    gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     found = survey(raw, name, block=block)
     notes: list[str] = []

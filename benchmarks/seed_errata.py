@@ -1,13 +1,17 @@
 """Slips of the three papers that gyrostab starts from, each with a number that shows it.
 
 P16: Wang et al., Sensors 16 (2016). P15: Wang et al., Measurement 75 (2015) 263. L13: Li et al., Chin. J. Lasers 40 (2013) 0908004.
-The formulae are evaluated here as they are printed, and beside them what is right; docs/seeds.md shows the table.
+The formulae are evaluated here as they are printed, and beside them what is right.
+
+    python benchmarks/seed_errata.py --output docs/seeds.md
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +23,6 @@ from gyrostab.fit import fit_noise
 from gyrostab.log import make_log
 from gyrostab.noise import LAWS, model_avar
 from gyrostab.simulate import simulate
-
-__all__ = ["Erratum", "errata"]
 
 Array = NDArray[np.float64]
 #: Noise of the west gyro at rest, L13, Table 1.
@@ -39,19 +41,7 @@ class Erratum(NamedTuple):
 
 
 def errata() -> list[Erratum]:
-    """Evaluate every slip.
-
-    Returns
-    -------
-    list of Erratum
-        In the order of docs/seeds.md.
-
-    Examples
-    --------
-    >>> first = errata()[0]
-    >>> first.where, round(first.as_printed), round(first.in_truth, 2)
-    ('P16 Eq. 5, 12', 10, 0.1)
-    """
+    """Evaluate every slip, in the order of docs/seeds.md."""
     return [show() for show in _SHOWN]
 
 
@@ -310,3 +300,21 @@ _SHOWN: tuple[Callable[[], Erratum], ...] = (
     _step_for_walk,
     _revolutions,
 )
+
+
+def main() -> None:
+    from page import renew
+
+    parser = argparse.ArgumentParser(description="Make the table of errata of docs/seeds.md.")
+    parser.add_argument("--output", type=Path, help="page to put the table into; printed only when not given")
+    chosen = parser.parse_args()
+    rows = ["| where | printed | right | shown by | as printed | right |", "| --- | --- | --- | --- | --- | --- |"]
+    for slip in errata():
+        rows.append(f"| {' | '.join(slip[:4])} | {slip.as_printed:.4g} | {slip.in_truth:.4g} |")
+    print("\n".join(rows))
+    if chosen.output:
+        renew(chosen.output, "errata", "\n".join(rows))
+
+
+if __name__ == "__main__":
+    main()
