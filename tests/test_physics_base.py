@@ -7,9 +7,10 @@ from dataclasses import fields, is_dataclass
 import numpy as np
 import pytest
 
-from gyrostab.errors import OptionError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import STAGES, Effect, Prediction, Windows
 from gyrostab.physics.registry import effect_table, effects, make_effect
+from gyrostab.simulate import simulate
 from gyrostab.units import INNER
 
 from .effect_bench import random_cuts, run, same_whatever_the_cuts
@@ -148,6 +149,26 @@ def test_units_and_ranges_are_kept(kind):
         if np.isfinite(item.high):
             with pytest.raises(OptionError, match="outside of the allowed range"):
                 kind.example(**{item.name: item.high * 2 + 1})
+
+
+@each
+def test_without_its_channel_it_says_which(kind):
+    effect = kind.example()
+    needs = effect.needs()
+    table = {item.name: list(value) if isinstance(value := getattr(effect, item.name), tuple) else value for item in effect.parameters()}
+    model = {"effect": [{"name": kind.name} | table], "noise": {}, "log": {"rate": 10, "duration": "1s"}}
+    if not needs:
+        assert simulate(model).sizes["time"] == 10
+        return
+    with pytest.raises(SchemaError, match=f"effect '{kind.name}' needs the channel '{needs[0]}' .*add it to the environment"):
+        simulate(model)
+
+
+@each
+def test_sizes_are_sourced_and_the_text_names_what_it_is_confused_with(kind):
+    for word in ("*DAVAR*", "*Window mean*", "*Spectrum*", "*Axes*", "Confused with", "References", "Examples"):
+        assert word in " ".join(kind.__doc__.split())
+    assert all(item.source for item in kind.parameters())
 
 
 # ---------------------------------------------------------------------------------------------------------------- models

@@ -16,24 +16,11 @@ from gyrostab.kernels.coloured import band, band_psd, folded_psd, oscillator, os
 from gyrostab.log import make_log
 from gyrostab.physics.base import Windows
 from gyrostab.physics.phase import fold
-from gyrostab.physics.registry import effects, make_effect
+from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import environment as env
 from gyrostab.simulate import simulate
 
 from .effect_bench import random_cuts, run, same_whatever_the_cuts
-
-MINE = (
-    "vibration_rectification",
-    "g_sensitivity",
-    "aliased_vibration",
-    "magnetic",
-    "spectral_line",
-    "rotation_line",
-    "scale_factor",
-    "misalignment",
-    "earth_rate",
-    "real_motion",
-)
 
 
 def sigma(rates, rate, taus):
@@ -555,23 +542,3 @@ def test_chunks_never_matter(seed, which):
     }[which]
     drivers = {name: values[:700] for name, values in DRIVERS.items()}
     same_whatever_the_cuts(make_effect(table), random_cuts(seed, 700), size=700, drivers=drivers, seed=seed)
-
-
-@pytest.mark.parametrize("name", MINE)
-def test_an_effect_without_its_channel_says_which(name):
-    effect = effects()[name].example()
-    if not effect.needs():
-        assert not effects()[name].channels
-        return
-    typical = {item.name: list(item.typical) if isinstance(item.typical, tuple) else item.typical for item in effect.parameters()}
-    channel = effect.needs()[0]
-    with pytest.raises(SchemaError, match=f"effect '{name}' needs the channel '{channel}' .*add it to the environment"):
-        simulate({"effect": [{"name": name, **typical}], "noise": {}, "log": {"rate": 10, "duration": "1s"}})
-
-
-@pytest.mark.parametrize("name", MINE)
-def test_sizes_are_sourced_and_the_text_names_what_it_is_confused_with(name):
-    kind = effects()[name]
-    for word in ("*DAVAR*", "*Window mean*", "*Spectrum*", "*Axes*", "Confused with", "References", "Examples"):
-        assert word in " ".join(kind.__doc__.split())
-    assert all(item.source for item in kind.parameters())

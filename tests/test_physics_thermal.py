@@ -26,18 +26,6 @@ from gyrostab.simulate import simulate
 
 from .effect_bench import random_cuts, run, same_whatever_the_cuts
 
-MINE = (
-    "shupe",
-    "thermal_gradient",
-    "warm_up",
-    "thermal_hysteresis",
-    "ageing_bias",
-    "temperature_noise",
-    "light_power_noise",
-    "vibration_noise",
-    "vibration_random_walk",
-    "ageing_noise",
-)
 HOUR = 3600.0
 
 
@@ -629,26 +617,6 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
     one, many = (simulate(model, seed=9, chunk=chunk).rate.values for chunk in (3000, 371))
     np.testing.assert_array_equal(one, many)
     assert np.isnan(one[:, 1000:1080]).all()
-
-
-@pytest.mark.parametrize("name", MINE)
-def test_an_effect_without_its_channel_says_which(name):
-    effect = effects()[name].example()
-    if not effect.needs():
-        assert not effects()[name].channels
-        return
-    typical = {item.name: item.typical for item in effect.parameters()}
-    channel = effect.needs()[0]
-    with pytest.raises(SchemaError, match=f"effect '{name}' needs the channel '{channel}' .*add it to the environment"):
-        simulate({"effect": [{"name": name, **typical}], "noise": {}, "log": {"rate": 10, "duration": "1s"}})
-
-
-@pytest.mark.parametrize("name", MINE)
-def test_sizes_are_sourced_and_the_text_names_what_it_is_confused_with(name):
-    kind = effects()[name]
-    for word in ("*DAVAR*", "*Window mean*", "*Spectrum*", "*Axes*", "Confused with", "References", "Examples"):
-        assert word in " ".join(kind.__doc__.split())
-    assert all(item.source for item in kind.parameters())
 
 
 @pytest.mark.parametrize(
