@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.kernels.state_space import whiten
+from gyrostab.kernels.state_space import flicker_states, whiten
 
 
 def walk_covariance(edges: np.ndarray) -> np.ndarray:
@@ -94,3 +94,23 @@ def test_slow_and_fast_processes_keep_their_digits():
     products, expected = dense(*case)
     np.testing.assert_allclose(whitened.T @ whitened, products, rtol=1e-7)
     assert log_determinant == pytest.approx(expected, rel=1e-8)
+
+
+def flicker_variogram(lag: np.ndarray) -> np.ndarray:
+    """Variance of the difference of two block means of flicker noise with B = 1, `lag` blocks apart: density 1 / (2 pi f)."""
+
+    def integral(x):
+        return np.where(x > 0, -(x**2) / 2.0 * np.log(np.maximum(x, 1e-300)) + 0.75 * x**2, 0.0)
+
+    covariance = (integral(lag + 1.0) - 2.0 * integral(lag * 1.0) + integral(np.abs(lag - 1.0))) / np.pi
+    return 2.0 * (2.0 * integral(np.array(1.0)) / np.pi - covariance)
+
+
+def test_processes_make_flicker_noise():
+    step, n = 20.0, 180
+    variance, time, white = flicker_states(step, step * n)
+    edges = np.arange(n + 1) * step
+    covariance = sum(v * relaxation_covariance(edges, t)[0] for v, t in zip(variance, time, strict=True))
+    lag = np.arange(1, n)
+    found = 2.0 * (covariance[0] + white - covariance[1:])
+    np.testing.assert_allclose(found, flicker_variogram(lag), rtol=0.05)

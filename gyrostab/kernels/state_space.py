@@ -12,9 +12,41 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["whiten"]
+__all__ = ["flicker_states", "whiten"]
 
 Array = NDArray[np.float64]
+#: Ratio of neighbouring correlation times in `flicker_states`.
+RATIO = 4.0
+#: Longest correlation time, in lengths of the record: slower parts are a constant in it.
+LONGEST = 4.0
+
+
+def flicker_states(step: float, span: float) -> tuple[Array, Array, float]:
+    """Flicker noise with B = 1 as Ornstein-Uhlenbeck processes for means over blocks, up to a constant.
+
+    Parameters
+    ----------
+    step, span : float
+        Length of a block and of the record [s].
+
+    Returns
+    -------
+    variance, time : ndarray, shape (p,)
+        Variances and correlation times [s] of the processes; the times stand in even log spacing.
+    white : float
+        Variance of a block mean by what is faster.
+
+    Examples
+    --------
+    >>> variance, time, white = flicker_states(20.0, 3600.0)
+    >>> time.round(1), float(variance[0].round(4))  # ln 4 / pi
+    (array([1.44e+04, 3.60e+03, 9.00e+02, 2.25e+02, 5.62e+01, 1.41e+01]), 0.4413)
+    """
+    count = 1 + max(0, round(np.log(LONGEST * span / (0.7 * step)) / np.log(RATIO)))
+    time = LONGEST * span * RATIO ** -np.arange(count, dtype=np.float64)
+    variance = np.full(count, np.log(RATIO) / np.pi)
+    faster = step / (time[-1] * RATIO ** -np.arange(1.0, 20.0))
+    return variance, time, float(variance[0] * (2.0 * (faster + np.expm1(-faster)) / faster**2).sum())
 
 
 @njit(**INNER)

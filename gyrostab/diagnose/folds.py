@@ -1,0 +1,78 @@
+"""Stretches of time that are held out: four interleaved folds, at three lengths.
+
+Short folds show events, long ones slow drifts, which a random walk would bridge over a short hole.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import SchemaError
+
+__all__ = ["FOLDS", "LENGTHS", "fold_blocks", "fold_subsets"]
+
+#: Folds of each length; the stretches of the record belong to them in turn.
+FOLDS = 4
+#: Length of a stretch [s], and the largest part of the record that it may be.
+LENGTHS = ((100.0, 1.0 / 36.0), (350.0, 1.0 / 10.0), (900.0, 1.0 / 4.0))
+
+
+def fold_blocks(reduced: xr.Dataset) -> xr.DataArray:
+    """Fold of every block at every length.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        From `reduce_log`; its dimension `block`, coordinates or variables `begin` and `end` [s] are used.
+
+    Returns
+    -------
+    xarray.DataArray
+        ``fold(length, block)``, 0 to 3; coordinate ``length`` is that of a stretch [s], a whole number of blocks.
+
+    Raises
+    ------
+    SchemaError
+        When there are fewer blocks than folds.
+
+    Examples
+    --------
+    >>> edges = np.arange(181) * 20.0
+    >>> reduced = xr.Dataset({"begin": ("block", edges[:-1]), "end": ("block", edges[1:])})
+    >>> folds = fold_blocks(reduced)
+    >>> folds.length.values, folds[0, :22].values
+    (array([100., 360., 900.]), array([0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 0, 0]))
+    """
+    begin, end = reduced["begin"].values, reduced["end"].values
+    n = begin.size
+    if n < FOLDS:
+        raise SchemaError(
+            f"the record has {n} blocks, fewer than the {FOLDS} parts of which each is held out in turn; give a longer record"
+        )
+    step = float(end[0] - begin[0])
+    span = n * step
+    blocks = [max(1, round(min(seconds, share * span) / step)) for seconds, share in LENGTHS]
+    fold = np.stack([np.arange(n) // count % FOLDS for count in blocks])
+    attributes = {"units": "s", "long_name": "length of a stretch that is held out"}
+    return xr.DataArray(
+        fold,
+        dims=("length", "block"),
+        coords={"length": ("length", step * np.array(blocks, dtype=np.float64), attributes)},
+        name="fold",
+        attrs={"units": "1", "long_name": "fold in which the block is held out"},
+    )
+
+
+def fold_subsets(fold: xr.DataArray) -> NDArray[np.bool_]:
+    """Blocks that are used: all of them, then all but one fold, fold after fold and length after length.
+
+    Returns
+    -------
+    ndarray of bool, shape (1 + lengths * FOLDS, block)
+    """
+    values = fold.transpose("length", "block").values
+    parts = [values != number for number in range(FOLDS)]
+    held = np.stack(parts, axis=1).reshape(-1, values.shape[1])
+    return np.concatenate([np.ones((1, values.shape[1]), np.bool_), held])
