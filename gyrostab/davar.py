@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import dask
@@ -22,6 +24,7 @@ from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, wi
 from gyrostab.noise import HOUR, avar_columns, sample_squares
 from gyrostab.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
 from gyrostab.schema import attributes
+from gyrostab.store.direct import can_fill, fill_row
 from gyrostab.timegrid import first_stamp, grid_times
 
 __all__ = ["davar", "davar_part", "davar_parts"]
@@ -125,7 +128,7 @@ def davar(
     return _label(cells, means, log, plan)
 
 
-def davar_parts(log: xr.Dataset, *, samples: int = 2**23, **options: Any) -> list[slice]:
+def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> list[slice]:
     """Cut the windows of a surface into parts that `davar_part` computes, each of whole units of work.
 
     Parameters
@@ -154,7 +157,8 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**23, **options: Any) -> lis
     per_unit = max(1, units[0].stop - units[0].start)
     cells = axes * plan.unit.ks.size
     together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit)))
-    return [slice(units[i].start, units[min(i + together, len(units)) - 1].stop) for i in range(0, len(units), together)]
+    edges = [number * len(units) // count for count in [-(-len(units) // together)] for number in range(count + 1)]
+    return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
 
 
 def davar_part(log: xr.Dataset, *, part: slice, **options: Any) -> xr.Dataset:
@@ -194,19 +198,29 @@ def davar_part(log: xr.Dataset, *, part: slice, **options: Any) -> xr.Dataset:
     if plan.attrs["method"] != "blocks":
         raise OptionError(f"method={plan.attrs['method']!r} is for whole logs; parts are computed with method='blocks'")
     data, unit = plan.signal.data, plan.unit
-    tables = _noise_tables(unit, plan.rate)
+    tables = _kept_tables(plan)
     units = [one for one in units_of_work(data.shape[1], unit) if one.start < part.stop and one.stop > part.start]
     begin, end = units[0].start * unit.step, last_sample(units[-1], unit)
-    together = range(0, data.shape[0], 1 if data.shape[0] * (end - begin) > _TOGETHER else data.shape[0])
     cells, means = [], []
-    for row in together:
-        values = in_memory(data[row : row + together.step, begin:end])
-        for line in values:
-            done = [_work(line[one.start * unit.step - begin : last_sample(one, unit) - begin], unit, tables) for one in units]
-            cells.append(np.concatenate([one[0] for one in done], axis=1))
-            means.append(np.concatenate([one[1] for one in done], axis=1))
+    for line in _rows(data, begin, end):
+        done = [_work(line[one.start * unit.step - begin : last_sample(one, unit) - begin], unit, tables) for one in units]
+        cells.append(np.concatenate([one[0] for one in done], axis=1))
+        means.append(np.concatenate([one[1] for one in done], axis=1))
     kept = slice(part.start - units[0].start, part.stop - units[0].start)
     return _label(np.stack(cells, axis=1)[:, :, kept], np.stack(means, axis=1)[:, :, kept], log, plan, part=part)
+
+
+def _rows(data: Any, begin: int, end: int) -> Iterator[NDArray[np.generic]]:
+    """The samples of each axis, one after the other; all are read together where they are few and dask must be asked."""
+    if isinstance(data, da.Array) and can_fill(data):
+        line = np.empty(end - begin, data.dtype)
+        for row in range(data.shape[0]):
+            fill_row(data, row, begin, line)
+            yield line
+        return
+    together = 1 if data.shape[0] * (end - begin) > _TOGETHER else data.shape[0]
+    for row in range(0, data.shape[0], together):
+        yield from in_memory(data[row : row + together, begin:end])
 
 
 def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -218,6 +232,17 @@ def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[
     dof = identify_noise(cells[0], cells[5], cells[6], cells[3], *tables)
     means[0] *= scale
     return np.concatenate([cells, dof[None]]), means
+
+
+def _kept_tables(plan: Plan) -> tuple[Any, ...]:
+    """`_noise_tables`, made once for all parts of a log."""
+    unit = plan.unit
+    return _tables_of(unit._replace(ks=tuple(unit.ks.tolist()), shifts=tuple(unit.shifts.tolist())), plan.rate)  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=4)
+def _tables_of(unit: Unit, rate: float) -> tuple[Any, ...]:
+    return _noise_tables(unit._replace(ks=np.array(unit.ks, dtype=np.int64), shifts=np.array(unit.shifts, dtype=np.int64)), rate)
 
 
 def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
@@ -296,8 +321,13 @@ def _label(cells: Any, means: Any, log: xr.Dataset, plan: Plan, *, part: slice |
     }
     variables["window_mean"] = (plane, means[0], attributes("window_mean"))
     variables["window_coverage"] = (plane, means[1], attributes("window_coverage"))
-    surface = xr.Dataset(
-        variables,
+    # The share of degrees of freedom that the gaps leave is what a fit needs beside the responses.
+    variables["gap_factor"] = (cube, cells[CELL_FIELDS.index("gap_factor")], attributes("gap_factor"))
+    groups = units_of_work(signal.sizes["time"], unit)
+    if part is None:  # the paper's convention leaves out the last window
+        groups = [slice(one.start, min(one.stop, first.size)) for one in groups if one.start < first.size]
+    return xr.Dataset(
+        {**variables, **window_channels(log, unit.window, unit.step, groups, part=part)},
         coords={
             "axis": ("axis", signal["axis"].values, attributes("axis")),
             "time": ("time", pd.DatetimeIndex(centre.view("datetime64[ns]")), {**attributes("time")}),
@@ -306,9 +336,3 @@ def _label(cells: Any, means: Any, log: xr.Dataset, plan: Plan, *, part: slice |
         },
         attrs={**log.attrs, **plan.attrs},
     )
-    # The share of degrees of freedom that the gaps leave is what a fit needs beside the responses.
-    surface["gap_factor"] = (cube, cells[CELL_FIELDS.index("gap_factor")], attributes("gap_factor"))
-    groups = units_of_work(signal.sizes["time"], unit)
-    if part is None:  # the paper's convention leaves out the last window
-        groups = [slice(one.start, min(one.stop, first.size)) for one in groups if one.start < first.size]
-    return surface.assign(window_channels(log, unit.window, unit.step, groups, part=part))

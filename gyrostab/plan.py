@@ -105,7 +105,7 @@ def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
     points = unit.window + (1 if unit.angle else 0)
     n_windows = (n_samples - points) // unit.step + 1
     # A unit works twice on what its last windows share with the next unit: the longer, the less of that.
-    length = max(4 * unit.window, min(16 * unit.window, 2**20), 2**18)
+    length = max(4 * unit.window, min(16 * unit.window, 2**21), 2**18)
     per_unit = max(8, min((length - unit.window) // unit.step, MOST_CELLS // unit.ks.size))
     return [slice(first, min(first + per_unit, n_windows)) for first in range(0, n_windows, per_unit)]
 

@@ -6,10 +6,14 @@ import uuid
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gyrostab.store.direct import can_fill, fill_row, with_fill
 
 __all__ = ["Part", "chunk_of", "lay"]
 
@@ -90,7 +94,8 @@ def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = F
     Returns
     -------
     dask.array.Array, shape (len(rows), size) or (size,)
-        Its graph has one task for each chunk, beside the tasks of the arrays.
+        Its graph has one task for each chunk, beside the tasks of the arrays. `gyrostab.store.direct.fill_row` reads it without them
+        where it can read the arrays so.
     """
     import dask.array as da
     from dask.highlevelgraph import HighLevelGraph
@@ -116,4 +121,39 @@ def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = F
             layer[(name, place) if flat else (name, number, place)] = task
     graph = HighLevelGraph.from_collections(name, layer, dependencies=list(sources.values()))
     chunks = (lengths,) if flat else ((1,) * len(rows), lengths)
-    return da.Array(graph, name, chunks, dtype=np.float64)
+    joined = da.Array(graph, name, chunks, dtype=np.float64)
+    if not all(can_fill(array) for parts in rows for array, _, _ in parts):
+        return joined
+    return with_fill(joined, partial(_fill, rows))
+
+
+def _fill(rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]) -> None:
+    """Samples of one row from `begin` on, as the tasks of `lay` make them."""
+    found = [one for part in rows[row] for one in _reaching(part, begin, begin + out.size)]
+    done = 0
+    for _, _, _, at, length in sorted(found, key=itemgetter(3)):
+        out[done:at] = np.nan  # nothing where at is before
+        done = max(done, at + length)
+    out[done:] = np.nan
+    taken: list[tuple[int, int]] = []
+    for array, own_row, own, at, length in found:
+        here = out[at : at + length]
+        if any(at < stop and start < at + length for start, stop in taken):
+            values = np.empty(length)
+            fill_row(array, own_row, own, values)
+            np.copyto(here, values, where=np.isnan(here))
+        else:
+            fill_row(array, own_row, own, here)
+        taken.append((at, at + length))
+
+
+def _reaching(part: Part, begin: int, end: int) -> list[tuple[Any, int, int, int, int]]:
+    """Of a part, what lies from `begin` to `end`: array, row, first sample of the array, first after `begin`, length."""
+    array, row, runs = part
+    low = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
+    high = np.searchsorted(runs[:, 0], end, side="left")
+    found = []
+    for sample, own, length in runs[low:high].tolist():
+        a, b = max(sample, begin), min(sample + length, end)
+        found.append((array, row or 0, own + a - sample, a - begin, b - a))
+    return found

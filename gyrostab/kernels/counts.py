@@ -45,14 +45,17 @@ def to_counts(values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill:
     return counts if same.all() else None
 
 
-def from_counts(counts: NDArray[np.integer[Any]], scale: float, fill: int) -> NDArray[np.float64]:
-    """Counts times their factor, NaN for `fill`.
+def from_counts(
+    counts: NDArray[np.integer[Any]], scale: float, fill: int, *, out: NDArray[np.floating[Any]] | None = None
+) -> NDArray[np.floating[Any]]:
+    """Counts times their factor, NaN for `fill`; into `out`, or into a new array of doubles.
 
     Examples
     --------
     >>> from_counts(np.array([1, -32767, 3], dtype="i2"), 0.1, -32767)
     array([0.1, nan, 0.3])
     """
-    values: NDArray[np.float64] = np.multiply(counts, np.float64(scale), dtype=np.float64)
-    values[counts == fill] = np.nan
+    values = np.empty(counts.shape) if out is None else out
+    np.multiply(counts, np.float64(scale), out=values)
+    np.copyto(values, np.nan, where=counts == fill)
     return values

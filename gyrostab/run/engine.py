@@ -12,7 +12,7 @@ import xarray as xr
 
 from gyrostab.davar import davar_part
 from gyrostab.export import to_netcdf
-from gyrostab.fit import fit_noise
+from gyrostab.fit import fit_part
 from gyrostab.progress import Stage
 from gyrostab.run.checkpoint import Block, assemble, write_block
 from gyrostab.run.schedule import Pool, in_any_order
@@ -29,9 +29,7 @@ def compute_part(log: xr.Dataset, part: slice, windows: Mapping[str, Any], fitti
     surface = davar_part(log, part=part, **windows)
     if fitting is None:
         return surface
-    if fitting.get("method") == "adev":
-        return fit_noise(surface, **fitting)
-    return fit_noise(surface.chunk(), **fitting).compute(scheduler="synchronous")
+    return fit_part(surface, **fitting)
 
 
 def compute_blocks(

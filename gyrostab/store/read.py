@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gyrostab.cf import declared_grids, decode_stamps, index_dim
 from gyrostab.errors import FormatError
 from gyrostab.kernels.counts import from_counts
+from gyrostab.store.direct import with_fill
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.timegrid import grid_times
 
@@ -97,7 +98,7 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
             dtype=variable.dtype,
             length=int(chunks[-1]),
             scale=disk.get("scale_factor"),
-            fill=disk.get("_FillValue"),
+            missing=disk.get("_FillValue"),
             spans=_spans(stored, dim, int(chunks[-1])),
             strict=strict,
             opened=opened,
@@ -108,7 +109,7 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
             array, chunks=tuple(chunks), name=f"gyrostab-{name}-{opened}", asarray=False, fancy=False, inline_array=True, meta=meta
         )
         packing = {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)} if array.scale is not None else {}
-        long[name] = xr.Variable(variable.dims, lazy, variable.attrs, packing)
+        long[name] = xr.Variable(variable.dims, with_fill(lazy, array.fill), variable.attrs, packing)
     return long
 
 
@@ -134,7 +135,7 @@ class _Chunks:
     dtype: np.dtype[Any]
     length: int
     scale: float | None
-    fill: Any
+    missing: Any
     spans: dict[str, Any] | tuple[tuple[int, int], ...]
     strict: bool
     opened: str
@@ -146,38 +147,38 @@ class _Chunks:
 
     def __getitem__(self, part: Any) -> NDArray[np.floating[Any]]:
         last = range(*part[-1].indices(self.shape[-1]))
-        if self.ndim == 1:
-            return self._row(None, last)
-        return np.stack([self._row(row, last) for row in range(*part[0].indices(self.shape[0]))])
+        rows = range(1) if self.ndim == 1 else range(*part[0].indices(self.shape[0]))
+        values = np.empty((len(rows), max(last.stop - last.start, 0)), self.dtype)
+        for row, line in zip(rows, values, strict=True):
+            self.fill(row, last.start, line)
+        values = values[:, :: last.step]
+        return values[0] if self.ndim == 1 else values
 
-    def _row(self, row: int | None, wanted: range) -> NDArray[np.floating[Any]]:
-        """Samples of one row; a damaged chunk of it is NaN."""
-        begin, end = wanted.start, wanted.stop
-        pieces = []
-        while begin < end:
-            number = begin // self.length
-            stop = min(end, (number + 1) * self.length)
+    def fill(self, row: int, begin: int, out: NDArray[np.floating[Any]]) -> None:
+        """Samples of one row, from `begin` on; those of a damaged chunk are NaN."""
+        end = begin + out.size
+        for number in range(begin // self.length, -(-end // self.length)):
+            first = number * self.length
+            low, high = max(begin, first), min(end, first + self.length)
+            place = out[low - begin : high - begin]
             try:
-                inside = slice(begin - number * self.length, stop - number * self.length)
-                pieces.append(self._decoded(self._stored(row, number)[inside]))
+                self._decode(self._stored(row, number)[low - first : high - first], place)
             except ChunkDamage as damage:
-                self._tell(row or 0, number, str(damage))
-                pieces.append(np.full(stop - begin, np.nan, self.dtype))
-            begin = stop
-        whole = pieces[0] if len(pieces) == 1 else np.concatenate([*pieces, np.empty(0, self.dtype)])
-        return whole[:: wanted.step]
+                self._tell(row, number, str(damage))
+                place[:] = np.nan
 
-    def _decoded(self, raw: NDArray[Any]) -> NDArray[np.floating[Any]]:
+    def _decode(self, raw: NDArray[Any], out: NDArray[np.floating[Any]]) -> None:
         if self.scale is not None:
-            return from_counts(raw, float(self.scale), int(self.fill))
-        values = raw.astype(self.dtype)
-        if self.fill is not None and self.fill == self.fill:
-            values[raw == self.fill] = np.nan
-        return values
+            from_counts(raw, float(self.scale), int(self.missing), out=out)
+            return
+        out[:] = raw
+        if self.missing is not None and self.missing == self.missing:
+            out[raw == self.missing] = np.nan
 
-    def _stored(self, row: int | None, number: int) -> NDArray[Any]:
+    def _stored(self, row: int, number: int) -> NDArray[Any]:
         """One chunk as it lies on disk; the last of a row has room for more than there is."""
-        whole = read_chunk(self.path, self.name, (number,) if row is None else (row, number), zarr=self.zarr, opened=self.opened)
+        place = (number,) if self.ndim == 1 else (row, number)
+        whole = read_chunk(self.path, self.name, place, zarr=self.zarr, opened=self.opened)
         if whole.size != self.length:
             raise ChunkDamage(f"is damaged: it holds {whole.size} values in place of {self.length}")
         return whole
