@@ -14,6 +14,9 @@ from gyrostab.errors import FormatError, OutputError
 
 __all__ = ["damaged_input", "new_output"]
 
+#: Looks, 20 ms apart, after which what has gone stays gone: a busy machine may hold a thread up that long.
+_LOOKS = 15
+
 
 @contextlib.contextmanager
 def new_output(path: str | os.PathLike[str], *, overwrite: bool = False, directory: bool = False) -> Iterator[Path]:
@@ -108,7 +111,7 @@ def _remove(path: Path) -> None:
     for _ in range(100):
         shutil.rmtree(path, ignore_errors=True)
         gone = 0 if path.exists() else gone + 1
-        if gone == 5:
+        if gone == _LOOKS:
             return
         time.sleep(0.02)
 

@@ -26,6 +26,7 @@ def test_imports_go_down_only():
     ("code", "banned"),
     [
         ("import gyrostab", (*HEAVY, "xarray", "pandas", "dask")),
+        ("import gyrostab.plot, gyrostab.report", ("matplotlib", "jinja2", "PIL", "scipy.stats")),
         ("import gyrostab.cli; gyrostab.cli.main(['--help'])", (*HEAVY, "xarray", "pandas", "dask")),
         ("import gyrostab.cli; gyrostab.cli.main(['run', '--help'])", (*HEAVY, "xarray", "pandas", "dask")),
     ],
