@@ -11,10 +11,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.stretches import Stretch, channel_at, numeric_channels
+from gyrostab.errors import UnitError
 from gyrostab.kernels import periodogram as kernel
 from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.timegrid import first_stamp, grid_times
-from gyrostab.units import INNER
+from gyrostab.units import INNER, parse_unit
 
 __all__ = ["HARMONICS", "PARTS", "PHASES", "Accumulator"]
 
@@ -58,7 +59,7 @@ class Accumulator:
         self.kept: list[Array] = []
         self.gaps: list[tuple[int, int]] = []
         self.open: int | None = None
-        self.turning = _source(log, "rotation_rate", INNER["rotation_rate"])
+        self.turning, self.turning_factor = _turning(log)
         self.turn_carry: float | None = None
         self.turns = 0.0
         self.order = np.full((self.axes, blocks, len(HARMONICS)), np.nan + 0j) if self.turning else None
@@ -178,7 +179,7 @@ class Accumulator:
         assert self.order is not None
         index = np.arange(part.start * self.length, part.stop * self.length)
         rotation, self.turn_carry = channel_at(self.turning, grid_times(self.start, self.rate, index), self.turn_carry)
-        inside = rotation / (360.0 * self.rate)
+        inside = rotation * self.turning_factor / (360.0 * self.rate)
         edges = np.cumsum(np.concatenate([[self.turns], inside]))
         self.turns = math.fmod(float(edges[-1]), 1.0)
         turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
@@ -204,11 +205,17 @@ def _neighbours(present: NDArray[np.bool_], weights: Array) -> Array:
     return np.asarray((tapered[:, 1:] * tapered[:, :-1]).sum(axis=-1) / (tapered**2).sum(axis=-1))
 
 
-def _source(log: xr.Dataset, name: str, units: str) -> Source | None:
-    """A channel at any instant; None when the log has it not in these units, or without a number."""
-    if name not in log.data_vars or log[name].attrs.get("units") != units or not np.isfinite(_range(log[name].data)).all():
-        return None
-    return make_source(log, name)
+def _turning(log: xr.Dataset) -> tuple[Source | None, float]:
+    """The rotation rate of the tool at any instant, and the factor to degree s-1; None when the log has it not, or without a number."""
+    name = "rotation_rate"
+    if name not in numeric_channels(log)[0] + numeric_channels(log)[1] or not np.isfinite(_range(log[name].data)).all():
+        return None, 1.0
+    wanted = parse_unit(INNER[name])
+    try:
+        found = parse_unit(str(log[name].attrs.get("units")))
+    except UnitError:
+        return None, 1.0
+    return (make_source(log, name), found.factor / wanted.factor) if found.quantity == wanted.quantity else (None, 1.0)
 
 
 def _range(data: Any) -> tuple[float, float]:

@@ -11,16 +11,16 @@ __all__ = ["count_outliers", "lattice_step"]
 
 Array = NDArray[np.float64]
 _SIGMA = 6.0
+_CLEAR = 64.0  # a lattice is as many times coarser than the last digit
 _NEAR = 2  # blocks on either side that help to tell a block's own noise
-#: Quantile of the absolute value -> what it is in standard normal numbers; the next one where the one before stands on a single value.
-_QUANTILES = {0.5: 0.6745, 0.75: 1.1503, 0.9: 1.6449, 0.99: 2.5758}
+_MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
 
 def count_outliers(histogram: NDArray[np.uint32], *, sigma: float = _SIGMA) -> NDArray[np.int64]:
     """Second differences beyond `sigma` robust standard deviations.
 
-    The deviation is that of the block and two neighbours on either side, from the median; at least a tenth of the record's, so that a
-    stretch of held samples does not make outliers of all the others.
+    The deviation is from the median: the larger of the block's own and of that which it has together with two neighbours on either
+    side, and at least a tenth of the record's.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def count_outliers(histogram: NDArray[np.uint32], *, sigma: float = _SIGMA) -> N
     sums = np.concatenate([np.zeros_like(histogram[:, :1], dtype=np.int64), np.cumsum(histogram, axis=1, dtype=np.int64)], axis=1)
     blocks = np.arange(histogram.shape[1])
     near = sums[:, np.minimum(blocks + _NEAR + 1, blocks.size)] - sums[:, np.maximum(blocks - _NEAR, 0)]
-    scale = np.maximum(_deviation(near), 0.1 * _deviation(sums[:, -1:]))
+    scale = np.maximum(np.maximum(_deviation(near), _deviation(np.diff(sums, axis=1))), 0.1 * _deviation(sums[:, -1:]))
     edges = np.concatenate([[0.0], histogram_edge(np.arange(1, HISTOGRAM))])
     first = np.searchsorted(edges, sigma * scale)  # the first bin that lies wholly above
     above = np.concatenate([np.cumsum(histogram[..., ::-1], axis=-1, dtype=np.int64)[..., ::-1], np.zeros((*scale.shape, 1), np.int64)], -1)
@@ -55,18 +55,14 @@ def count_outliers(histogram: NDArray[np.uint32], *, sigma: float = _SIGMA) -> N
 
 
 def _deviation(histogram: NDArray[np.int64]) -> Array:
-    """Standard deviation from quantiles; the lowest that does not fall among the zeros."""
-    total = np.cumsum(histogram, axis=-1)
-    scale = np.zeros(histogram.shape[:-1])
-    for quantile, normal in _QUANTILES.items():
-        wanted = quantile * total[..., -1]
-        number = np.argmax(total >= np.maximum(wanted, 1)[..., None], axis=-1)
-        before = np.take_along_axis(total, np.maximum(number - 1, 0)[..., None], axis=-1)[..., 0]
-        inside = np.take_along_axis(histogram, number[..., None], axis=-1)[..., 0]
-        share = np.divide(wanted - before, inside, out=np.ones(scale.shape), where=inside > 0)
-        here = (scale == 0) & (number > 0) & (total[..., -1] > 0)
-        scale[here] = (histogram_edge(number + share) / normal)[here]
-    return scale
+    """Standard deviation from the median of those that are not 0, which held samples make."""
+    total = np.cumsum(histogram[..., 1:], axis=-1)
+    wanted = total[..., -1] / 2.0
+    number = np.argmax(total >= np.maximum(wanted, 1)[..., None], axis=-1)
+    inside = np.take_along_axis(histogram, number[..., None] + 1, axis=-1)[..., 0]
+    before = np.take_along_axis(total, number[..., None], axis=-1)[..., 0] - inside
+    share = np.divide(wanted - before, inside, out=np.ones(wanted.shape), where=inside > 0)
+    return np.asarray(np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / _MEDIAN, 0.0))
 
 
 def lattice_step(values: Array) -> float:
@@ -88,29 +84,26 @@ def lattice_step(values: Array) -> float:
         return 0.0
     levels = np.unique(finite)
     size = float(np.abs(levels).max())
-    for resolution in (2.0**-52, 2.0**-23):  # as written in double and in single precision
+    for resolution in (2.0**-23, 2.0**-52):  # as written in single and in double precision
         fine = 8.0 * resolution * size
         apart = np.diff(levels)
         apart = apart[apart > fine]
-        if apart.size == 0 or apart.size > 0.8 * finite.size:
-            continue
-        step = _common(apart, fine)
-        if step > 0.0:
-            return step
+        if 0 < apart.size <= 0.8 * finite.size:
+            step = _common(apart, fine)
+            if step > 0.0:
+                return step
     return 0.0
 
 
 def _common(apart: Array, fine: float) -> float:
-    """Largest number of which all distances are multiples, but for `fine` errors; 0 when there is none well above them."""
+    """Largest number of which all distances are multiples, but for `fine` errors; 0 when there is none well above these."""
     step = float(apart.min())
-    for _ in range(60):
-        rest = np.abs(apart - np.round(apart / step) * step)
-        allowed = fine * (1.0 + apart / step)
-        wrong = rest > allowed
+    while step > _CLEAR * fine:
+        whole = np.round(apart / step)
+        near = whole < step / (16.0 * fine)  # farther ones may be off by their number times the error of the step
+        rest = np.abs(apart - whole * step)
+        wrong = near & (rest > 2.0 * fine * (1.0 + whole))
         if not wrong.any():
-            whole = np.round(apart / step)
-            return float(apart.sum() / whole.sum())
+            return float(apart[near].sum() / whole[near].sum())
         step = float(rest[wrong].min())
-        if step <= 16.0 * fine:
-            return 0.0
     return 0.0

@@ -1,0 +1,374 @@
+"""The reduction of a log to block statistics, against sums written out and against the statistics of simulated noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from gyrostab.diagnose.outliers import lattice_step
+from gyrostab.diagnose.reduced import block_samples, reduce_log
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.kernels.periodogram import band_edges, ordinates, taper
+from gyrostab.log import make_log
+from gyrostab.noise import URAD_PER_S
+from gyrostab.simulate import simulate
+
+RATE = 100.0
+
+
+def log_of(values: np.ndarray, *, rate: float = RATE, channels: dict[str, tuple[np.ndarray, str]] | None = None, **options) -> xr.Dataset:
+    return make_log(np.atleast_2d(values), rate=rate, unit="deg/h", channels=channels, **options)
+
+
+def with_gaps(values: np.ndarray, kind: str, rng: np.random.Generator, size: int = 400) -> np.ndarray:
+    """Samples lost at random, or in one stretch of every block."""
+    values = values.copy()
+    if kind == "random":
+        values[rng.random(values.shape) < 0.3] = np.nan
+    elif kind == "stretches":
+        for block in values.reshape(-1, size):
+            first = rng.integers(0, size)
+            block[first : first + rng.integers(size // 10, 7 * size // 10)] = np.nan
+    return values
+
+
+# ------------------------------------------------------------------------------------------------------------- the spectrum
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 2**31), size=st.sampled_from([96, 100, 135]), lost=st.floats(0.0, 0.6), offset=st.floats(-1e5, 1e5))
+def test_powers_are_the_sums_of_their_definition(seed: int, size: int, lost: float, offset: float):
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((2, 24 * size)) + offset
+    x[rng.random(x.shape) < lost] = np.nan
+    reduced = reduce_log(log_of(x), block=f"{size}samples")
+    weights, edges, number = taper(size), band_edges(size), int(rng.integers(0, 24))
+    part = x[:, number * size : (number + 1) * size]
+    angle = np.exp(-2j * np.pi * np.outer(np.arange(ordinates(size) + 1), np.arange(size)) / size)
+    for row in range(2):
+        there = ~np.isnan(part[row])
+        if there.mean() < 0.25:
+            assert np.isnan(reduced.power.values[row, number]).all()
+            continue
+        mean = part[row][there].mean()
+        # every ordinate is a sum c . y over the samples; the mean is in c
+        c = angle[:, there] * weights[there] - (angle[:, there] @ weights[there])[:, None] / there.sum()
+        ordinate, expected = c @ (part[row][there] - mean), (np.abs(c) ** 2).sum(axis=1)
+        for band in range(edges.size - 1):
+            k = slice(edges[band], edges[band + 1])
+            assert reduced.power.values[row, number, band] == pytest.approx(
+                (np.abs(ordinate[k]) ** 2).sum() / expected[k].sum() / RATE, rel=1e-6
+            )
+        assert reduced["mean"].values[row, number] == pytest.approx(mean, rel=1e-12, abs=1e-9)
+    both = ~np.isnan(part).any(axis=0)
+    if both.mean() >= 0.25:
+        y = part[:, both] - part[:, both].mean(axis=1, keepdims=True)
+        c = angle[:, both] * weights[both] - (angle[:, both] @ weights[both])[:, None] / both.sum()
+        one, other = c @ y[0], c @ y[1]
+        k = slice(edges[3], edges[4])
+        wanted = (one[k] * other[k].conj()).sum() / (np.abs(c[k]) ** 2).sum() / RATE
+        assert reduced.cross.values[0, number, 3] == pytest.approx(wanted, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize("gaps", ["none", "random", "stretches"])
+def test_white_noise_has_its_density_and_the_gamma_distribution_of_the_shape(gaps: str):
+    rng = np.random.default_rng(4)
+    x = with_gaps(3.0 * rng.standard_normal(3000 * 400), gaps, rng)
+    reduced = reduce_log(log_of(x), block="400samples")
+    power, shape = reduced.power.values[0] / (9.0 / RATE), reduced["shape"].values[0]
+    there = np.isfinite(power[:, 0])
+    power, shape = power[there], shape[there]
+    error = np.sqrt(1.0 / shape.mean(axis=0) / power.shape[0])
+    assert np.all(np.abs(power.mean(axis=0) - 1.0) < 4.5 * error)
+    spread = ((power - 1.0) ** 2 * shape).mean(axis=0)  # 1 for a gamma distribution of this shape
+    assert np.all(np.abs(spread - 1.0) < 0.13)
+    for band in range(3, power.shape[1]):
+        assert stats.kstest(stats.gamma.cdf(power[:, band] * shape[:, band], shape[:, band]), "uniform").pvalue > 1e-4
+
+
+def test_whole_blocks_lose_little_to_the_taper():
+    reduced = reduce_log(log_of(np.random.default_rng(0).standard_normal(40_000)), block="1000samples")
+    widths = np.diff(band_edges(1000))
+    share = reduced["shape"].values[0, 0] / widths
+    assert np.all((share > 0.8) & (share <= 1.0))
+    assert reduced.neighbours.values == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("noise", "tolerance"), [({"Q": 5.0}, 0.05), ({"N": 0.003, "K": 5.0}, 0.12)])
+def test_densities_through_random_gaps_are_mixed_by_the_share_of_neighbours(noise: dict[str, float], tolerance: float):
+    log = simulate({"noise": noise, "log": {"axes": ["x"]}}, duration="2h", rate=50.0, seed=8).compute()
+    lost = np.random.default_rng(1).random(log.rate.shape) < 0.4
+    reduced = reduce_log(log.assign(rate=log.rate.where(~lost)), block="10s")
+    f = reduced.frequency.values
+    omega = 2.0 * np.pi * f
+    density = np.zeros_like(f)
+    fine = np.linspace(0.0, 25.0, 20001)[1:]
+    if "Q" in noise:  # first difference of white angles
+        level = (noise["Q"] * URAD_PER_S) ** 2 * 50.0
+        density += level * (2.0 * np.sin(omega / 100.0)) ** 2
+        mean = 2.0 * level
+    else:
+        white, walk = (noise["N"] * 60.0) ** 2, (noise["K"] / 60.0) ** 2
+        density += white + walk / omega**2
+        seen = fine[fine >= 0.05]  # block means are taken off
+        mean = white + np.sum(walk / (2 * np.pi * seen) ** 2) * (fine[1] - fine[0]) / 25.0
+    share = float(reduced.neighbours.mean())
+    assert share == pytest.approx(0.6, abs=0.01)
+    wanted = share * density + (1.0 - share) * mean
+    found = reduced.power.mean("block").values[0]
+    assert found[4:] == pytest.approx(wanted[4:], rel=tolerance)
+
+
+def test_a_sine_lands_in_its_band_and_on_its_line():
+    seconds = np.arange(60_000) / RATE
+    reduced = reduce_log(log_of(2.0 * np.sin(2 * np.pi * 13.0 * seconds)), block="10s")
+    power, width = reduced.power.values[0], (reduced.band_high - reduced.band_low).values
+    band = int(np.searchsorted(reduced.band_low.values, 13.0) - 1)
+    assert np.all(np.argmax(power, axis=1) == band)
+    assert power[:, band] * width[band] * 2.0 == pytest.approx(2.0, rel=0.1)  # a square of 2**2 / 2, less or more by the taper's shape
+    lines = reduced.line_power.values[0]
+    assert lines.shape[0] == 8
+    assert np.all(reduced.line_frequency.values[np.argmax(lines, axis=1)] == 13.0)
+
+
+def test_line_spectra_average_the_blocks_of_an_eighth():
+    rng = np.random.default_rng(3)
+    reduced = reduce_log(log_of(rng.standard_normal(240_000)), block="5s")  # 480 blocks
+    assert reduced.line_weight.values == pytest.approx(60.0)
+    lines = reduced.line_power.values * RATE
+    assert lines.mean() == pytest.approx(1.0, abs=0.02)
+    assert lines.var() * 60.0 == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("gaps", ["none", "random"])
+def test_what_axes_and_channels_share_is_in_their_cross_spectra(gaps: str):
+    rng = np.random.default_rng(7)
+    shared, own = rng.standard_normal(200_000), rng.standard_normal((3, 200_000))
+    x = own + np.array([[0.5], [-0.4], [0.0]]) * shared
+    witness = shared + 0.1 * rng.standard_normal(shared.size)
+    x = np.stack([with_gaps(row, gaps, rng) for row in x])
+    witness = with_gaps(witness, gaps, rng)
+    reduced = reduce_log(log_of(x, channels={"accel_x": (witness, "g")}), block="500samples")
+    assert [(str(a), str(b)) for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)] == [
+        ("x", "y"),
+        ("x", "z"),
+        ("y", "z"),
+    ]
+    cross = reduced.cross.mean("block").values * RATE
+    assert cross[0].real == pytest.approx(-0.2, abs=0.15)
+    assert np.mean(cross[0][-6:]).real == pytest.approx(-0.2, abs=0.02)
+    assert np.abs(np.mean(cross[:, -6:], axis=1)[1:]).max() < 0.02
+    coupling = (reduced.witness_cross.sel(axis="x", witness="accel_x").mean("block") * RATE).values
+    assert np.mean(coupling[-6:]) == pytest.approx(0.5, abs=0.02)
+    assert (reduced.witness_power.mean("block").values[0] * RATE)[-6:] == pytest.approx(1.01, abs=0.03)
+
+
+# ------------------------------------------------------------------------------------------------- what is locked, and counts
+
+
+def test_orders_are_the_amplitudes_that_turn_with_the_tool():
+    rng, size = np.random.default_rng(2), 120_000
+    seconds = np.arange(size) / RATE
+    speed = 90.0 + 40.0 * np.sin(2 * np.pi * seconds / 300.0)  # deg/s
+    turns = (np.cumsum(speed) - speed / 2.0) / 360.0 / RATE
+    x = 5.0 * np.cos(2 * np.pi * turns + 0.7) + 2.0 * np.cos(6 * np.pi * turns - 1.0) + 0.5 * rng.standard_normal(size)
+    x[rng.random(size) < 0.2] = np.nan
+    reduced = reduce_log(log_of(x, channels={"rotation_rate": (speed, "deg/s")}), block="20s")
+    order = reduced.order.values[0]
+    assert np.abs(order[:, 0].mean() - 5.0 * np.exp(0.7j)) < 0.15
+    assert np.abs(order[:, 2].mean() - 2.0 * np.exp(-1.0j)) < 0.15
+    assert np.abs(order[:, 1].mean()) < 0.15
+
+
+def test_orders_follow_a_rotation_sensor_with_its_own_slower_time_and_are_silent_at_rest():
+    model = {
+        "noise": {"N": 1e-4},
+        "log": {"axes": ["x", "y"]},
+        "effect": [{"name": "earth_rate", "latitude": 45.0}],
+        "environment": [{"profile": "rotation", "points": [[0, 0], [590, 0], [600, 360], [1200, 360]], "sensor_rate": 10}],
+    }
+    log = simulate(model, duration="20min", rate=RATE, seed=1).compute()
+    reduced = reduce_log(log, block="20s")
+    order = reduced.order.values[..., 0]
+    still, turning = reduced.end.values <= 580.0, reduced.begin.values >= 610.0
+    assert np.isnan(order[:, still]).all()
+    size = np.abs(order[:, turning])
+    assert np.all(np.abs(size / size.mean() - 1.0) < 0.05)
+    assert 1.0 < size.mean() < 15.05
+    quarter = np.angle(order[1, turning] / order[0, turning])
+    assert np.abs(np.abs(quarter) - np.pi / 2) == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_profile_shows_the_error_by_phase_of_the_ramp():
+    rng, size = np.random.default_rng(6), 90_000
+    ramp = rng.random(size) * 32767
+    x = 4.0 * (ramp / 32767 > 0.75) + rng.standard_normal(size) + 1e5
+    reduced = reduce_log(log_of(x, channels={"ramp": (ramp, "1")}), block="5s")
+    weights = reduced.profile_samples.values[0]
+    profile = (np.nan_to_num(reduced.profile.values[0]) * weights).sum(axis=0) / weights.sum(axis=0)
+    assert weights.sum() == size
+    assert profile == pytest.approx(np.where(reduced.phase.values > 0.75, 3.0, -1.0), abs=0.15)
+
+
+def test_marks_are_counted_where_they_are():
+    rng = np.random.default_rng(9)
+    x = rng.standard_normal(60 * 1000)
+    clean = reduce_log(log_of(x), block="10s")
+    assert int(clean.outliers.sum()) == 0
+    assert int(clean.repeats.sum() + clean.zeros.sum()) == 0
+    assert int(clean.extremes.sum()) == 2
+    assert clean.lattice.values == 0.0
+    assert np.abs(clean.kurtosis.values).max() < 0.6
+    y = x.copy()
+    y[5_500] += 40.0
+    y[10_200:10_220] = y[10_199]
+    y[20_100:20_105] = 0.0
+    y[30_000:31_000] = np.clip(y[30_000:31_000], -1.0, 50.0)
+    y[40_000:50_000] *= 30.0  # louder, and yet without outliers
+    marked = reduce_log(log_of(y), block="10s")
+    assert marked.outliers.values[0, 5] == 3
+    assert int(marked.outliers.sum()) - 3 <= 3  # the edges of the loud stretch at most
+    assert marked.repeats.values[0, 10] == 20
+    assert marked.repeats.values[0, 20] == 4
+    assert marked.zeros.values[0, 20] == 5
+    assert marked.kurtosis.values[0, 5] > 10.0
+    assert marked.kurtosis.values[0, 30] < -0.3
+    clipped = reduce_log(log_of(np.clip(x, -2.0, 2.0)), block="10s")
+    assert int(clipped.extremes.sum()) == int((np.abs(x) >= 2.0).sum())
+
+
+def test_held_samples_do_not_make_outliers_of_the_others():
+    rng = np.random.default_rng(9)
+    x = rng.standard_normal(60 * 1000)
+    x[20_000:24_500] = x[20_000]
+    assert int(reduce_log(log_of(x), block="10s").outliers.sum()) == 0
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), step=st.floats(0.01, 3.0), offset=st.floats(-5e4, 5e4), single=st.booleans())
+def test_the_lattice_is_found_whatever_its_offset(seed: int, step: float, offset: float, single: bool):
+    noise = np.random.default_rng(seed).standard_normal(8000)
+    values = np.round(noise / step) * step + offset
+    values = values.astype(np.float32).astype(np.float64) if single else values
+    if not single or step > 1.01 * 64 * 8 * 2.0**-23 * np.abs(values).max():
+        assert lattice_step(values) == pytest.approx(step, rel=1e-3)
+    smooth = noise * step + offset
+    assert lattice_step(smooth) == 0.0
+
+
+# -------------------------------------------------------------------------------------------------------- channels and spans
+
+
+def test_channels_are_averaged_over_blocks_whatever_their_own_time():
+    model = {
+        "noise": {"N": 0.01},
+        "log": {"axes": ["x"]},
+        "environment": [
+            {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 20], [1200, 60]], "sensor_rate": 0.1},
+            {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": [[0, 28], [600, 24]], "sensor_rate": 2.0},
+        ],
+    }
+    log = simulate(model, duration="20min", rate=RATE, seed=1).compute()
+    log["vibration"] = ("time", np.tile([3.0, -4.0], 60_000), {"units": "g"})
+    reduced = reduce_log(log, block="5s")
+    centre = (reduced.begin + reduced.end).values / 2.0
+    warm = reduced.channel_temperature
+    assert warm.attrs["units"] == "degree_Celsius"
+    assert np.isfinite(warm.values[:-2]).all()  # the last sample of the sensor lies before the end
+    assert warm.values[:-2] == pytest.approx(20.0 + centre[:-2] / 30.0, abs=0.1)
+    assert reduced.channel_supply_voltage.values == pytest.approx(np.where(centre < 600, 28.0, 24.0))
+    assert reduced.channel_vibration.values == pytest.approx(np.sqrt(12.5))
+
+
+def test_a_channel_that_falls_silent_is_missing_there():
+    log = log_of(np.random.default_rng(0).standard_normal(60_000))
+    stamps = log.time.values[::100]
+    keep = np.r_[0:200, 400:600]
+    log["temperature"] = ("time_temperature", np.full(400, 50.0), {"units": "degree_Celsius"})
+    log = log.assign_coords(time_temperature=stamps[keep])
+    found = reduce_log(log, block="5s").channel_temperature.values
+    assert np.isnan(found[41:79]).all()
+    assert np.all(found[np.r_[0:39, 81:119]] == 50.0)
+
+
+def test_long_gaps_and_restarts_are_listed_in_seconds():
+    x = np.random.default_rng(0).standard_normal((2, 60_000))
+    x[:, 10_000:10_050] = np.nan  # too short
+    x[:, 20_000:20_300] = np.nan
+    x[0, 30_000:32_000] = np.nan  # one axis only
+    x[:, 39_950:41_000] = np.nan  # over the edge of a block
+    reduced = reduce_log(log_of(x), block="10s")
+    assert np.stack([reduced.gap_begin, reduced.gap_end], axis=1).tolist() == [[200.0, 203.0], [399.5, 410.0]]
+    assert np.stack([reduced.restart_begin, reduced.restart_end], axis=1).tolist() == [[399.5, 410.0]]
+    assert reduced.samples.values[0, 30:32].tolist() == [0, 0]
+    assert np.isnan(reduced["mean"].values[0, 30:32]).all()
+    assert np.isfinite(reduced["mean"].values[1, 30:32]).all()
+    assert reduced.attrs["missing_share"] == pytest.approx((50 + 300 + 1000 + 1050) / 60_000)
+
+
+def test_restarts_that_the_log_tells_are_taken():
+    model = {"noise": {"N": 0.01}, "log": {"axes": ["x"]}, "environment": [{"profile": "power_cuts", "cuts": [[300, 302], [900, 930]]}]}
+    log = simulate(model, duration="20min", rate=10.0, seed=1)
+    reduced = reduce_log(log)
+    assert reduced.restart_begin.values == pytest.approx([300.0, 900.0])
+    assert reduced.restart_end.values == pytest.approx([302.0, 930.0])
+
+
+@settings(max_examples=10, deadline=None)
+@given(chunk=st.integers(300, 9000), seed=st.integers(0, 100))
+def test_chunks_change_nothing(chunk: int, seed: int):
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((2, 20_000))
+    x[:, rng.random(20_000) < 0.1] = np.nan
+    speed, ramp = 100.0 + rng.standard_normal(20_000), rng.random(20_000)
+    log = log_of(x, channels={"rotation_rate": (speed, "deg/s"), "ramp": (ramp, "1")})
+    whole, cut = reduce_log(log), reduce_log(log.chunk(time=chunk))
+    for name in whole.variables:
+        if whole[name].dtype.kind in "fc":
+            np.testing.assert_allclose(cut[name].values, whole[name].values, rtol=1e-9, atol=1e-12, err_msg=str(name))
+        else:
+            assert whole[name].identical(cut[name]), name
+
+
+def test_an_angle_log_is_that_of_its_rates():
+    rates = np.random.default_rng(5).standard_normal((1, 30_000)) + 10.0
+    angle = np.concatenate([[[0.0]], np.cumsum(rates, axis=1) / 3600.0 / RATE], axis=1)
+    log = make_log(angle, rate=RATE, unit="deg", kind="angle")
+    one, other = reduce_log(log_of(rates)), reduce_log(log.chunk(time=7001))
+    assert other.power.values == pytest.approx(one.power.values, rel=1e-4)
+    assert other["mean"].values == pytest.approx(one["mean"].values, abs=1e-6)
+
+
+# -------------------------------------------------------------------------------------------------------------------- manners
+
+
+def test_blocks_suit_the_length_of_the_record():
+    assert block_samples(24 * 3600 * 400, 400.0) == 8000
+    days = block_samples(200 * 3600 * 400, 400.0)
+    assert 200 * 3600 * 400 / days == pytest.approx(6000, rel=0.05)
+    assert 7_400 / block_samples(7_400, 200.0) >= 24
+    assert block_samples(360_000, 99.3) in range(1900, 1987)
+
+
+def test_a_record_that_is_too_short_is_told_how_long_it_must_be():
+    with pytest.raises(OptionError, match=r"record of 20 s .* too short .* 24 s at least"):
+        reduce_log(log_of(np.zeros(2000)))
+    with pytest.raises(OptionError, match="give a shorter block"):
+        reduce_log(log_of(np.zeros(20_000)), block="60s")
+    with pytest.raises(OptionError, match="needs 16"):
+        reduce_log(log_of(np.zeros(20_000)), block="0.1s")
+
+
+def test_what_is_no_log_is_refused():
+    with pytest.raises(SchemaError):
+        reduce_log(xr.Dataset())
+
+
+def test_progress_reaches_its_end():
+    told = []
+    reduce_log(log_of(np.random.default_rng(0).standard_normal((3, 50_000))), progress=lambda *given: told.append(given))
+    assert told[-1][2] == told[-1][1] > 0.98 * 3 * 50_000
