@@ -10,7 +10,7 @@ import os
 import tempfile
 import uuid
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import IO, Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
 
-__all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "Spool", "Stored", "lazily", "put", "take"]
+__all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "Spool", "Stored", "lazily", "put", "take", "together"]
 
 #: Columns of one file together stay in memory up to this size [bytes].
 SPILL_BYTES = 128 * 2**20
@@ -115,10 +115,12 @@ def put(column: NDArray[Any] | Stored, rows: NDArray[np.int64], value: int) -> N
 class Buffers:
     """Columns of 8-byte numbers that grow block by block.
 
-    Up to `limit` bytes they are lists of arrays; beyond it they are appended to a spool.
+    Up to `limit` bytes they are lists of arrays; beyond it they are appended to a spool. In memory, the columns `rows_of` become the
+    rows of one array.
     """
 
-    def __init__(self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES):
+    def __init__(self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES, rows_of: Sequence[Any] = ()):
+        self.rows_of = rows_of
         self.dtypes = {key: np.dtype(dtype) for key, dtype in dtypes.items()}
         self.limit = limit
         self.rows = 0
@@ -147,8 +149,26 @@ class Buffers:
     def finish(self) -> dict[Any, NDArray[Any] | Stored]:
         """The columns: arrays in memory, or columns in a temporary file."""
         if self._spool is None:
-            return {key: np.concatenate(parts) if parts else np.empty(0, self.dtypes[key]) for key, parts in self._parts.items()}
+            matrix = np.empty((len(self.rows_of), self.rows))
+            found: dict[Any, NDArray[Any] | Stored] = {}
+            for key, parts in self._parts.items():
+                found[key] = matrix[self.rows_of.index(key)] if key in self.rows_of else np.empty(self.rows, self.dtypes[key])
+                if parts:
+                    np.concatenate(parts, out=found[key])
+                parts.clear()
+            return found
         return {key: Stored(self._spool, self.dtypes[key], *pieces) for key, pieces in self._pieces.items()}
+
+
+def together(columns: Sequence[Any]) -> Any:
+    """Columns as the rows of one array, numpy if they are, without a copy if they are the rows of one already."""
+    if not isinstance(columns[0], np.ndarray):
+        import dask.array
+
+        return dask.array.stack(columns)
+    whole = columns[0].base
+    same = whole is not None and whole.ndim == 2 and len(whole) == len(columns) and all(column.base is whole for column in columns)
+    return whole if same else np.stack(columns)
 
 
 def lazily(values: NDArray[Any] | Stored) -> Any:

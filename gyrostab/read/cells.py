@@ -1,4 +1,4 @@
-"""Text cells to numbers and stamps: the fast way (pyarrow, whole blocks) and the careful way (cell by cell)."""
+"""Text cells to numbers and stamps: plain rows (a kernel), odd ones (pyarrow, whole pieces) and the careful way (cell by cell)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from gyrostab.read.columns import Plan
 from gyrostab.read.layout import BLANK, Layout, is_number, split_line
 from gyrostab.read.options import ReadOptions
-from gyrostab.read.stamps import NAT, cells_to_ns, integers_to_ns
+from gyrostab.read.stamps import NAT, TimeUnit, cells_to_ns, integers_to_ns
 
-__all__ = ["Typing", "parse_cells", "parse_fast", "stamp_types"]
+__all__ = ["Typing", "parse_cells", "parse_fast", "parse_plain", "stamp_types"]
 
 #: Cells that mean "no value"; other words are unreadable.
 VOID = ("", "nan", "NaN", "NAN", "-nan", "null", "NULL", "NA", "N/A", "None")
@@ -35,11 +35,47 @@ class Typing:
     sources: list[int] = field(init=False)
     gyro: frozenset[int] = field(init=False)
     time: int | None = field(init=False)
+    digits: int = field(init=False)
 
     def __post_init__(self) -> None:
         self.sources = [column.source for column in self.plan.columns if column.role != "time"]
         self.gyro = frozenset(column.source for column in self.plan.of("gyro"))
         self.time = next((column.source for column in self.plan.of("time")), None)
+        unit = self.unit
+        self.digits = unit.digits if unit is not None and unit.digits is not None and unit.digits <= 9 else 0
+
+    @property
+    def unit(self) -> TimeUnit | None:
+        """Unit of a numeric time column."""
+        return next((column.time_unit for column in self.plan.of("time")), None)
+
+
+def parse_plain(block: bytes, start: int, rows: int, typing: Typing) -> tuple[Parsed, int]:
+    """Parse the plain rows of a block (up to `rows`) from the byte `start` on, and tell where the first begins that is not plain."""
+    from gyrostab.kernels.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, read_rows
+
+    layout = typing.layout
+    roles = np.full(layout.width, SKIPPED, dtype=np.int64)
+    roles[typing.sources] = NUMBER
+    if typing.time is not None:
+        roles[typing.time] = NUMERIC_TIME if typing.unit else ISO
+    separator = BLANKS if layout.separator == BLANK else ord(layout.separator)
+    point = ord("," if layout.decimal_comma else ".")
+    text = np.frombuffer(block, dtype=np.uint8)
+    numbers, stamps, stop = read_rows(text, start, roles, separator=separator, point=point, digits=typing.digits, rows=rows)
+    values = dict(zip(sorted(typing.sources), numbers, strict=True))
+    return (values, None if typing.time is None else _since_epoch(stamps, typing)), stop
+
+
+def _since_epoch(counts: NDArray[np.int64], typing: Typing) -> NDArray[np.int64]:
+    """Stamps [ns since 1970] of whole numbers of nanoseconds, or of units that are no decimal part of a second."""
+    unit = typing.unit
+    if unit is None:
+        return counts
+    if unit.ns != 10**typing.digits:
+        return np.where(counts == NAT, NAT, integers_to_ns(counts, unit, typing.options.epoch_ns))
+    zero = typing.options.epoch_ns if unit.epoch is None else unit.epoch
+    return counts if zero == 0 else np.where((counts != NAT) & _sum_fits(counts, zero), counts + np.int64(zero), NAT)
 
 
 def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
@@ -145,9 +181,7 @@ def _sum_fits(counts: NDArray[np.int64], zero: int) -> NDArray[np.bool_]:
     return (counts <= limit) & (counts >= -limit)
 
 
-def parse_cells(
-    piece: bytes, first: int, typing: Typing
-) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None, int, list[int]]:
+def parse_cells(piece: bytes, typing: Typing) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None, int]:
     """Read a piece of text line by line.
 
     Returns
@@ -158,18 +192,13 @@ def parse_cells(
         Stamps [ns since 1970].
     words : int
         Cells of channels that hold something that is neither a number nor void.
-    lines : list of int
-        Line number of every row.
     """
     width = typing.layout.width
     rows: list[list[str] | None] = []
-    lines: list[int] = []
-    for number, text in enumerate(piece.decode("latin-1").split("\n"), first):
+    for text in piece.decode("latin-1").split("\n"):
         bare = text.split("#")[0].strip("\r") if "#" in text else text.strip("\r")
-        if not bare.strip():
-            continue
-        lines.append(number)
-        rows.append(_row(bare, typing.layout, width))
+        if bare.strip():
+            rows.append(_row(bare, typing.layout, width))
     words = 0
     values = {}
     for source in typing.sources:
@@ -181,7 +210,7 @@ def parse_cells(
             cells = (rows[index] for index in bad)
             words += sum(1 for row in cells if row is not None and row[source].strip().lower() not in _VOID)
         values[source] = numbers
-    return values, _cell_stamps(rows, typing), words, lines
+    return values, _cell_stamps(rows, typing), words
 
 
 def _row(text: str, layout: Layout, width: int) -> list[str] | None:

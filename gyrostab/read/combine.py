@@ -101,11 +101,9 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
         coords["time"] = ("row", _end_to_end([part["time"].data for part in parts]))
     if signal is not None:
         axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
-        rows = []
+        stack = _stacked(parts, signal, axes)
         for axis in axes:
-            rows.append(_end_to_end([_axis(part, signal, axis) for part in parts]))
             absent[f"axis {axis}"] = [name for name, part in zip(names, parts, strict=True) if axis not in part["axis"].values]
-        stack = np.stack(rows) if isinstance(rows[0], np.ndarray) else _dask().stack(rows)
         packing = common_packing(part[signal].encoding for part in parts)
         data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]}, packing)
         coords["axis"] = np.array(axes, dtype=str)
@@ -125,6 +123,19 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
         unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
     )
     return joined
+
+
+def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
+    """The signal of all parts, (axis, row); NaN where a part lacks an axis."""
+    if all(isinstance(part[signal].data, np.ndarray) for part in parts):
+        whole = np.full((len(axes), sum(part.sizes["row"] for part in parts)), np.nan)
+        end = 0
+        for part in parts:
+            end += part.sizes["row"]
+            for axis in map(str, part["axis"].values):
+                whole[axes.index(axis), end - part.sizes["row"] : end] = part[signal].sel(axis=axis).data
+        return whole
+    return _dask().stack([_end_to_end([_axis(part, signal, axis) for part in parts]) for axis in axes])
 
 
 def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
@@ -147,7 +158,7 @@ def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
 def _end_to_end(columns: list[Any]) -> Any:
     if all(isinstance(column, np.ndarray) for column in columns):
         return np.concatenate(columns)
-    return _dask().concatenate([_dask().asarray(column) for column in columns])
+    return _dask().concatenate([_dask().from_array(column, name=False) if isinstance(column, np.ndarray) else column for column in columns])
 
 
 def _dask() -> Any:

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.read.buffers import SPILL_BYTES, Buffers, Stored, lazily, put, take
+from gyrostab.read.buffers import SPILL_BYTES, Buffers, Stored, lazily, put, take, together
 from gyrostab.read.columns import Column, Plan
 from gyrostab.read.options import ReadOptions
 from gyrostab.read.stamps import NAT
@@ -51,7 +51,7 @@ class Intake:
         dtypes: dict[int, Any] = {column.source: np.float64 for column in [*self.gyro, *self.channels]}
         if self.time is not None:
             dtypes[self.time.source] = np.int64
-        self.buffers = Buffers(dtypes, limit=limit)
+        self.buffers = Buffers(dtypes, limit=limit, rows_of=[column.source for column in self.gyro])
         self.bad_rows = self.bad_cells = self.cells = self.cell_rows = 0
         self.bad_places: list[str] = []
         self.cell_places: list[str] = []
@@ -97,26 +97,13 @@ class Intake:
 
     def _clean(self, column: Column, values: NDArray[np.float64]) -> NDArray[np.bool_] | None:
         """Convert to the inner unit in place, infinities to NaN; the mask of what is missing, or None when nothing is."""
-        finite = np.isfinite(values)
-        self._note_whole(column, values if finite.all() else values[finite])
-        if column.factor != 1.0:
-            values *= column.factor
-        if column.offset != 0.0:
-            values += column.offset
-        if finite.all():
-            return None
-        missing = ~finite
-        values[missing] = np.nan
-        return missing
+        from gyrostab.kernels.rows import clean_column
 
-    def _note_whole(self, column: Column, values: NDArray[np.float64]) -> None:
-        """Keep the span of a column of whole numbers, as long as it is one."""
+        missing, low, high, whole = clean_column(values, column.factor, column.offset)
         span = self.whole[column.source]
-        if span is None or not len(values):
-            return
-        head = values[:1000]
-        is_whole = bool((head == np.rint(head)).all() and (values == np.rint(values)).all())
-        self.whole[column.source] = (min(span[0], float(values.min())), max(span[1], float(values.max()))) if is_whole else None
+        if span is not None and missing < len(values):
+            self.whole[column.source] = (min(span[0], low), max(span[1], high)) if whole else None
+        return np.isnan(values) if missing else None
 
     def _packing(self, columns: Sequence[Column]) -> dict[str, Any]:
         """The encoding of columns of whole numbers that have one factor; none for others."""
@@ -185,8 +172,7 @@ class Intake:
         coords: dict[str, Any] = {}
         if self.gyro and self.plan.signal is not None:
             axes = [column.name for column in self.gyro]
-            parts = [columns[column.source] for column in self.gyro]
-            stack = np.stack(parts) if isinstance(parts[0], np.ndarray) else _dask_stack(parts)
+            stack = together([columns[column.source] for column in self.gyro])
             data[self.plan.signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[self.plan.signal]}, self._packing(self.gyro))
             coords["axis"] = np.array(axes, dtype=str)
         for column in self.channels:
@@ -210,12 +196,6 @@ class Intake:
         if self.options.start is not None and self.time is not None:
             notes.append("--start is not used: the file has its own time column")
         return notes
-
-
-def _dask_stack(parts: list[Any]) -> Any:
-    import dask.array
-
-    return dask.array.stack(parts)
 
 
 def _places(places: Sequence[str], total: int) -> str:

@@ -1,19 +1,21 @@
 """Text logs: comma, semicolon, tab or blank separated, plain or gzipped, in one pass of bounded memory.
 
-Blocks of the file go to pyarrow with fixed column types. A block that does not parse is cut into small pieces, and only the
-pieces that hold the trouble are read cell by cell.
+Plain rows are read by a kernel, several blocks of the file side by side. From a row on that it does not know, a piece goes another
+way, and the more of them the longer it gets: a short one cell by cell, a long one to pyarrow, and only if that fails cell by cell.
 """
 
 from __future__ import annotations
 
 import gzip
+import os
 import re
 import zlib
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
 import xarray as xr
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.read.buffers import SPILL_BYTES
-from gyrostab.read.cells import Typing, parse_cells, parse_fast, stamp_types
+from gyrostab.read.cells import Typing, parse_cells, parse_fast, parse_plain, stamp_types
 from gyrostab.read.columns import Column, Plan, plan_columns
 from gyrostab.read.intake import Intake, summary_notes, summary_stamp
 from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line
@@ -32,10 +34,13 @@ __all__ = ["matches", "read", "scan"]
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 HEAD_BYTES = 2**18
-BLOCK_BYTES = 2**24
+BLOCK_BYTES = 2**22
 PIECE_BYTES = 2**18
+LINE_BYTES = 2**8
+SHORT_BYTES = 2**13
 PART_BYTES = 2**16
 COUNTED_BYTES = 2**24
+MOST_WORKERS = 4
 
 
 def matches(path: Path) -> bool:
@@ -82,8 +87,11 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     intake = Intake(plan.check(), options, limit=limit)
     typing = Typing(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
-    for block in _ahead(_blocks(path, layout.offset)):
-        line = _take(block, line, typing, intake)
+    for taken in _side_by_side(_blocks(path, layout.offset), partial(_take, typing=typing)):
+        for part in taken:
+            if part.rows:
+                intake.add(part.values, part.stamps, words=part.words, locate=partial(_line_names, part, line))
+            line += part.lines
     return intake.finish(layout.notes)
 
 
@@ -163,56 +171,77 @@ def _blocks(path: Path, offset: int) -> Iterator[bytes]:
             yield rest + b"\n"
 
 
-def _ahead(blocks: Iterator[bytes]) -> Iterator[bytes]:
-    """The same blocks, each fetched (and decompressed) while the one before it is being parsed."""
-    with ThreadPoolExecutor(1, thread_name_prefix="gyrostab-read") as pool:
-        following = pool.submit(next, blocks, b"")
+def _side_by_side(blocks: Iterator[bytes], work: Callable[[bytes], list[_Part]]) -> Iterator[list[_Part]]:
+    """Do the work on the blocks, a few at a time, and fetch (and decompress) the next ones meanwhile; results come in their order."""
+    workers = min(os.cpu_count() or 1, MOST_WORKERS)
+    with ThreadPoolExecutor(1, thread_name_prefix="gyrostab-fetch") as fetcher, ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[list[_Part]]] = deque()
+        following = fetcher.submit(next, blocks, b"")
         while block := following.result():
-            following = pool.submit(next, blocks, b"")
-            yield block
+            following = fetcher.submit(next, blocks, b"")
+            waiting.append(pool.submit(work, block))
+            if len(waiting) > workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
-def _take(block: bytes, line: int, typing: Typing, intake: Intake) -> int:
-    """Read one block into the intake; the number of the line after it."""
-    lines = block.count(b"\n")
-    tidy = _tidy(block, typing.layout.separator)
-    if not _take_fast(tidy, lines, line, typing, intake):
-        first = line
-        start = 0
-        while start < len(tidy):
-            stop = tidy.find(b"\n", start + PIECE_BYTES) + 1 or len(tidy)
-            piece = tidy[start:stop]
-            count = piece.count(b"\n")
-            if not _take_fast(piece, count, first, typing, intake):
-                values, stamps, words, numbers = parse_cells(piece, first, typing)
-                intake.add(values, stamps, words=words, locate=partial(_line_names, numbers))
-            first += count
-            start = stop
-    return line + lines
+class _Part(NamedTuple):
+    """Rows of a block that were read in one way: their values and stamps, and the text, whose lines tell where a row stands."""
+
+    values: dict[int, NDArray[np.float64]]
+    stamps: NDArray[np.int64] | None
+    words: int
+    lines: int
+    block: bytes
+    span: slice
+
+    @property
+    def rows(self) -> int:
+        return len(next(iter(self.values.values()))) if self.values else len(self.stamps) if self.stamps is not None else 0
 
 
-def _take_fast(piece: bytes, lines: int, first: int, typing: Typing, intake: Intake) -> bool:
-    parsed = parse_fast(piece, typing)
-    if parsed is None:
-        return False
-    values, stamps = parsed
-    rows = len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
+def _take(block: bytes, typing: Typing) -> list[_Part]:
+    """Read one block."""
+    parts: list[_Part] = []
+    start, reach, left = 0, LINE_BYTES, _lines(block, slice(None))
+    while start < len(block):
+        (values, stamps), stop = parse_plain(block, start, left, typing)
+        if stop > start:
+            lines = left if stop == len(block) else _lines(block, slice(start, stop))
+            parts.append(_Part(values, stamps, 0, lines, block, slice(start, stop)))
+            left -= lines
+        if stop == len(block):
+            break
+        reach = LINE_BYTES if stop - start > PIECE_BYTES else min(4 * reach, PIECE_BYTES)
+        start = block.find(b"\n", min(stop + reach, len(block) - 1)) + 1
+        parts.append(_take_piece(_tidy(block[stop:start], typing.layout.separator), typing))
+        left -= parts[-1].lines
+    return parts
 
-    if rows != lines and b'"' in piece and rows != sum(1 for text in piece.split(b"\n") if text.strip()):
-        return False  # a stray quote has swallowed line ends
 
-    def locate(wanted: Sequence[int]) -> list[str]:
-        if rows == lines:
-            return [f"line {first + row}" for row in wanted]
-        filled = [number for number, text in enumerate(piece.split(b"\n"), first) if text.strip()]
-        return [f"line {filled[row]}" for row in wanted]
-
-    intake.add(values, stamps, locate=locate)
-    return True
+def _lines(block: bytes, span: slice) -> int:
+    return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8)[span] == 10))
 
 
-def _line_names(numbers: Sequence[int], rows: Sequence[int]) -> list[str]:
-    return [f"line {numbers[row]}" for row in rows]
+def _take_piece(piece: bytes, typing: Typing) -> _Part:
+    """Read rows of which one at least is not plain."""
+    lines = piece.count(b"\n")
+    parsed = parse_fast(piece, typing) if len(piece) > SHORT_BYTES else None
+    if parsed is not None:
+        part = _Part(*parsed, 0, lines, piece, slice(None))
+        if part.rows == lines or b'"' not in piece or part.rows == sum(1 for text in piece.split(b"\n") if text.strip()):
+            return part  # otherwise a stray quote has swallowed line ends
+    values, stamps, words = parse_cells(piece, typing)
+    return _Part(values, stamps, words, lines, piece, slice(None))
+
+
+def _line_names(part: _Part, first: int, rows: Sequence[int]) -> list[str]:
+    if part.rows == part.lines:
+        return [f"line {first + row}" for row in rows]
+    tidy = _tidy(part.block[part.span], ",")
+    filled = [number for number, text in enumerate(tidy.split(b"\n"), first) if text.strip()]
+    return [f"line {filled[row]}" for row in rows]
 
 
 def _tidy(block: bytes, separator: str) -> bytes:

@@ -1,0 +1,419 @@
+"""Rows of plain text to numbers and stamps: what nearly every row of nearly every log looks like, and nothing else.
+
+Cells are decimal numbers, dates as ISO 8601 writes them, or void. The first row that holds anything else ends the work, and the
+caller reads that row in another way. Numbers are rounded as `float` rounds them, to the last bit; stamps are whole nanoseconds.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import INNER, KERNEL
+
+__all__ = ["BLANKS", "ISO", "NUMBER", "NUMERIC_TIME", "SKIPPED", "clean_column", "read_rows"]
+
+#: What a column holds.
+SKIPPED, NUMBER, NUMERIC_TIME, ISO = range(4)
+#: Separator code of runs of blanks and tabs.
+BLANKS = 32
+
+_NAT = np.iinfo(np.int64).min
+_TAB, _LINE, _RETURN, _BLANK, _QUOTE, _HASH, _PERCENT = 9, 10, 13, 32, 34, 35, 37
+_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _E, _SMALL_E, _SMALL_A, _SMALL_N = 43, 45, 46, 48, 58, 84, 90, 69, 101, 97, 110
+_DIGITS = 19  # that surely fit into 64 bits
+_EXACT = np.uint64(1) << np.uint64(53)
+_TENS = 10.0 ** np.arange(23)
+_WHOLE_TENS = np.array([10**n for n in range(20)], dtype=np.uint64)
+_LEAST, _MOST = -60, 40
+_HALF = np.uint64(2**32 - 1)
+_FULL = np.uint64(2**64 - 1)
+_ZEROS, _TO_TEN, _TOPS = np.uint64(0x3030303030303030), np.uint64(0x7676767676767676), np.uint64(0x8080808080808080)
+_FIRST_PAIRS, _FIRST_SCALE, _SECOND_SCALE = np.uint64(0xFF000000FF), np.uint64(0xF424000000064), np.uint64(0x271000000001)
+_LONGEST_NS = np.uint64(2**63 - 1)
+
+
+def _fives() -> NDArray[np.uint64]:
+    """The leading 128 bits of the powers of five from `_LEAST` to `_MOST`, in two words each."""
+    words = []
+    for power in range(_LEAST, _MOST + 1):
+        if power < 0:
+            five = 5**-power
+            bits = (five - 1).bit_length()
+            value = 2 ** (bits + 127 if power >= -27 else 2 * bits + 128) // five + 1
+        else:
+            value = 5**power << 128
+        value >>= value.bit_length() - 128
+        words.append((value >> 64, value & (2**64 - 1)))
+    return np.array(words, dtype=np.uint64)
+
+
+_FIVES = _fives()
+
+
+@intrinsic
+def _byte(typing, text, at):  # type: ignore[no-untyped-def]
+    """The byte at an address: arrays are counted whenever they are handed on, which would cost more than the reading."""
+
+    def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.load(builder.inttoptr(builder.add(*arguments), ir.IntType(8).as_pointer()))
+
+    return types.uint8(types.intp, types.intp), load
+
+
+@intrinsic
+def _eight(typing, text, at):  # type: ignore[no-untyped-def]
+    """Eight bytes from an address on; the first is the lowest."""
+
+    def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.load(builder.inttoptr(builder.add(*arguments), ir.IntType(64).as_pointer()), align=1)
+
+    return types.uint64(types.intp, types.intp), load
+
+
+@intrinsic
+def _zeros_behind(typing, word):  # type: ignore[no-untyped-def]
+    """How many bits after the last one that is set are not; 64 in nothing."""
+
+    def count(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.cttz(arguments[0], ir.IntType(1)(0))
+
+    return types.uint64(types.uint64), count
+
+
+@njit(**INNER)
+def _product(a, b):  # type: ignore[no-untyped-def]
+    """High and low word of the product of two words."""
+    half = np.uint64(32)
+    a0, a1, b0, b1 = a & _HALF, a >> half, b & _HALF, b >> half
+    low = a0 * b0
+    middle = a1 * b0 + (low >> half)
+    other = a0 * b1 + (middle & _HALF)
+    return a1 * b1 + (middle >> half) + (other >> half), (other << half) | (low & _HALF)
+
+
+@njit(**INNER)
+def _rounded(mantissa, power):  # type: ignore[no-untyped-def]
+    """The double nearest to ``mantissa * 10**power``, and whether it was found (Lemire, Software: Practice and Experience 51, 2021)."""
+    if mantissa == np.uint64(0):
+        return 0.0, True
+    if power < _LEAST or power > _MOST:
+        return 0.0, False
+    if mantissa <= _EXACT and abs(power) < len(_TENS):
+        return (mantissa / _TENS[-power], True) if power < 0 else (mantissa * _TENS[power], True)
+    shifted = np.int64(0)
+    while not mantissa >> np.uint64(63):
+        mantissa <<= np.uint64(1)
+        shifted += 1
+    high, low = _product(mantissa, _FIVES[power - _LEAST, 0])
+    if high & np.uint64(0x1FF) == np.uint64(0x1FF):
+        more, _ = _product(mantissa, _FIVES[power - _LEAST, 1])
+        low += more
+        if more > low:
+            high += np.uint64(1)
+    if low == _FULL and power < -27:
+        return 0.0, False
+    top = np.int64(high >> np.uint64(63))
+    shift = np.uint64(top + 9)
+    kept = high >> shift
+    if low <= np.uint64(1) and -4 <= power <= 23 and kept & np.uint64(3) == np.uint64(1) and kept << shift == high:
+        kept &= ~np.uint64(1)
+    kept += kept & np.uint64(1)
+    kept >>= np.uint64(1)
+    return math.ldexp(np.float64(kept), ((217706 * power) >> 16) + 63 + top - shifted - 52), True
+
+
+@njit(**INNER)
+def _digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
+    """Go on with a whole number: its value, and where it ends.
+
+    Eight bytes at a time, as a loop over digits ends where the processor does not expect it.
+    """
+    while at + 8 <= size:
+        bare = _eight(text, at) ^ _ZEROS
+        other = ((bare + _TO_TEN) | bare) & _TOPS
+        count = _zeros_behind(other) >> np.uint64(3)
+        if count == np.uint64(0):
+            return mantissa, at
+        bare <<= (np.uint64(8) - count) << np.uint64(3)
+        pairs = bare * np.uint64(10) + (bare >> np.uint64(8))
+        high = (pairs & _FIRST_PAIRS) * _FIRST_SCALE
+        value = (high + ((pairs >> np.uint64(16)) & _FIRST_PAIRS) * _SECOND_SCALE) >> np.uint64(32)
+        mantissa = mantissa * _WHOLE_TENS[count] + value
+        at += np.int64(count)
+        if count < np.uint64(8):
+            return mantissa, at
+    while True:
+        digit = np.uint8(_byte(text, at) - np.uint8(_ZERO))
+        if digit > 9:
+            return mantissa, at
+        mantissa = mantissa * np.uint64(10) + np.uint64(digit)
+        at += 1
+
+
+@njit(**INNER)
+def _decimal(text, at, size, point):  # type: ignore[no-untyped-def]
+    """Sign, digits, decimals and end of a number without exponent; the end is negative where there is none, or a long one."""
+    negative = _byte(text, at) == _MINUS
+    at += np.int64(negative) | np.int64(_byte(text, at) == _PLUS)
+    first = at
+    mantissa, at = _digits(text, at, size, np.uint64(0))
+    count, decimals = at - first, np.int64(0)
+    if _byte(text, at) == point:
+        after = at + 1
+        mantissa, at = _digits(text, after, size, mantissa)
+        decimals = at - after
+        count += decimals
+    if count > _DIGITS:
+        while _byte(text, first) == _ZERO or _byte(text, first) == point:  # zeros in front do not count
+            count -= _byte(text, first) == _ZERO
+            first += 1
+    return negative, mantissa, decimals, at if 0 < count <= _DIGITS or (count == 0 and decimals > 0) else np.int64(-1)
+
+
+@njit(**INNER)
+def _number(text, at, size, point):  # type: ignore[no-untyped-def]
+    """Value of a number, and its end; the end is negative where there is none."""
+    negative, mantissa, decimals, end = _decimal(text, at, size, point)
+    if end < 0:
+        here = at + (_byte(text, at) == _MINUS)
+        if _byte(text, here) | 32 == _SMALL_N and _byte(text, here + 1) | 32 == _SMALL_A and _byte(text, here + 2) | 32 == _SMALL_N:
+            return np.nan, here + 3
+        return 0.0, end
+    power = -decimals
+    if _byte(text, end) | 32 == _SMALL_E:
+        down = _byte(text, end + 1) == _MINUS
+        first = end + 1 + (down or _byte(text, end + 1) == _PLUS)
+        exponent, end = _digits(text, first, size, np.uint64(0))
+        if not 0 < end - first < 4:
+            return 0.0, np.int64(-1)
+        power += -np.int64(exponent) if down else np.int64(exponent)
+    value, found = _rounded(mantissa, power)
+    return -value if negative else value, end if found else np.int64(-1)
+
+
+@njit(**INNER)
+def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-def]
+    """A number of time as a whole number of ``10**-digits``, half to even, and its end."""
+    negative, mantissa, decimals, end = _decimal(text, at, size, point)
+    if end < 0 or (digits == 0 and decimals > 0) or decimals - digits > 18:
+        return np.int64(0), np.int64(-1)
+    if decimals <= digits:
+        scale = _WHOLE_TENS[digits - decimals]
+        if mantissa > _LONGEST_NS // scale:
+            return np.int64(0), np.int64(-1)
+        count = np.int64(mantissa * scale)
+    else:
+        scale = _WHOLE_TENS[decimals - digits]
+        whole, rest = mantissa // scale, mantissa % scale
+        odd = whole & np.uint64(1)
+        count = np.int64(whole + np.uint64(np.uint64(2) * rest + odd > scale))
+    return -count if negative else count, end
+
+
+@njit(**INNER)
+def _two(text, at):  # type: ignore[no-untyped-def]
+    """A number of two digits, or one above 99."""
+    tens, ones = np.uint8(_byte(text, at) - np.uint8(_ZERO)), np.uint8(_byte(text, at + 1) - np.uint8(_ZERO))
+    return np.int64(10 * tens + ones) if tens < 10 and ones < 10 else np.int64(1000)
+
+
+@njit(**INNER)
+def _days(year, month, day):  # type: ignore[no-untyped-def]
+    """Days since 1970-01-01 (years begin in March)."""
+    year -= month <= 2
+    age = year - 1600
+    of_year = (153 * (month - 3 if month > 2 else month + 9) + 2) // 5 + day - 1
+    return 365 * age + age // 4 - age // 100 + age // 400 + of_year - 135080
+
+
+@njit(**INNER)
+def _iso(text, at, size):  # type: ignore[no-untyped-def]
+    """Nanoseconds since 1970 of ``2026-01-02T03:04:05.678Z`` (or a blank for the T, no Z), and its end."""
+    none = (np.int64(0), np.int64(-1))
+    if at + 19 >= size:
+        return none
+    year = 100 * _two(text, at) + _two(text, at + 2)
+    month, day, hour, minute, second = (
+        _two(text, at + 5), _two(text, at + 8), _two(text, at + 11), _two(text, at + 14), _two(text, at + 17),
+    )  # fmt: skip
+    if _byte(text, at + 4) != _MINUS or _byte(text, at + 7) != _MINUS or _byte(text, at + 13) != _COLON or _byte(text, at + 16) != _COLON:
+        return none
+    if (_byte(text, at + 10) != _T and _byte(text, at + 10) != _BLANK) or not (1700 <= year < 2200 and 1 <= month <= 12 and day >= 1):
+        return none
+    short = month == 4 or month == 6 or month == 9 or month == 11
+    leap = year % 4 == 0 and (year % 100 != 0 or year % 400 == 0)
+    last = 28 + leap if month == 2 else 31 - short
+    if day > last or hour > 23 or minute > 59 or second > 59:
+        return none
+    end, part = at + 19, np.uint64(0)
+    if _byte(text, end) == _POINT:
+        part, stop = _digits(text, end + 1, size, np.uint64(0))
+        length = stop - end - 1
+        if not 0 < length <= 9:
+            return none
+        part *= _WHOLE_TENS[9 - length]
+        end = stop
+    if _byte(text, end) == _Z:
+        end += 1
+    seconds = ((_days(year, month, day) * 24 + hour) * 60 + minute) * 60 + second
+    return seconds * 1_000_000_000 + np.int64(part), end
+
+
+@njit(**INNER)
+def _past_blanks(text, at, separator):  # type: ignore[no-untyped-def]
+    while _byte(text, at) == _BLANK or (_byte(text, at) == _TAB and separator != _TAB):
+        at += 1
+    return at
+
+
+@njit(**INNER)
+def _cell_end(text, at, separator, last):  # type: ignore[no-untyped-def]
+    """Where the next cell, or line, begins after a cell that ends at `at`; negative where the row does not go on as it should."""
+    at = _past_blanks(text, at, separator)
+    if last:
+        at += _byte(text, at) == _RETURN
+        return at + 1 if _byte(text, at) == _LINE else np.int64(-1)
+    if separator == BLANKS:  # one was passed, or there is another cell's text here
+        return at if _byte(text, at) != _LINE and _byte(text, at) != _RETURN else np.int64(-1)
+    return at + 1 if _byte(text, at) == separator else np.int64(-1)
+
+
+@njit(**INNER)
+def _skipped(text, at, separator):  # type: ignore[no-untyped-def]
+    """The end of a cell that is not wanted; negative where quotes or comments make it unsure."""
+    while _byte(text, at) != _LINE and _byte(text, at) != separator and not (separator == BLANKS and _byte(text, at) == _TAB):
+        if _byte(text, at) == _QUOTE or _byte(text, at) == _HASH:
+            return np.int64(-1)
+        at += 1
+    return at - 1 if at and _byte(text, at) == _LINE and _byte(text, at - 1) == _RETURN else at
+
+
+@njit(**INNER)
+def _is_void(text, at, separator):  # type: ignore[no-untyped-def]
+    return _byte(text, at) == separator or _byte(text, at) == _LINE or _byte(text, at) == _RETURN
+
+
+@njit(**INNER)
+def _cell(text, at, size, role, separator, point, digits):  # type: ignore[no-untyped-def]
+    """Number, stamp and end of a cell; the end is negative where it is not plain."""
+    if role == SKIPPED:
+        return 0.0, np.int64(0), _skipped(text, at, separator)
+    if _is_void(text, at, separator):
+        return np.nan, np.int64(_NAT), at
+    if role == NUMBER:
+        value, end = _number(text, at, size, point)
+        return value, np.int64(0), end
+    stamp, end = _iso(text, at, size) if role == ISO else _count_of_time(text, at, size, point, digits)
+    return 0.0, stamp, end
+
+
+@njit(**INNER)
+def _next_row(text, at, size):  # type: ignore[no-untyped-def]
+    """Where the next line begins that is neither blank nor a comment."""
+    while at < size:
+        here = _past_blanks(text, at, np.int64(_TAB))
+        if _byte(text, here) == _HASH or _byte(text, here) == _PERCENT:
+            while _byte(text, here) != _LINE:
+                here += 1
+        here += _byte(text, here) == _RETURN
+        if _byte(text, here) != _LINE:
+            break
+        at = here + 1
+    return at
+
+
+@njit(**KERNEL)
+def _read_rows(lines, start, roles, separator, point, digits, values, stamps):  # type: ignore[no-untyped-def]
+    """`read_rows`, into `values` and `stamps`."""
+    text, size, width = lines.ctypes.data, len(lines), len(roles)
+    row, begin = np.int64(0), _next_row(text, np.int64(start), size)
+    while begin < size and row < len(stamps):
+        number, at = np.int64(0), begin
+        for column in range(width):
+            at = _past_blanks(text, at, separator)
+            first, role = at, roles[column]
+            value, stamp, at = _cell(text, at, size, role, separator, point, digits)
+            if role == NUMBER:
+                values[number, row] = value
+                number += 1
+            elif role != SKIPPED:
+                stamps[row] = stamp
+            end = at
+            at = _cell_end(text, at, separator, column == width - 1) if at >= 0 else at
+            if at < 0 or (separator == BLANKS and (end == first or at == end)):
+                return row, begin
+        begin = _next_row(text, at, size)
+        row += 1
+    return row, begin
+
+
+def read_rows(
+    text: NDArray[np.uint8], start: int, roles: NDArray[np.int64], *, separator: int, point: int, digits: int, rows: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
+    """Read rows up to the first that is not plain.
+
+    Parameters
+    ----------
+    text : ndarray of uint8
+        Whole lines; the last byte is the end of a line.
+    start : int
+        Where to begin, at the beginning of a line.
+    roles : ndarray of int64
+        What each column holds: `SKIPPED`, `NUMBER`, `NUMERIC_TIME`, `ISO`.
+    separator, point : int
+        Codes of the separator (`BLANKS` for runs of them) and of the decimal point.
+    digits : int
+        Numbers of time are rounded to so many decimals and given as whole numbers of the last; with 0 they must be whole.
+    rows : int
+        Room for rows: as many lines as there are.
+
+    Returns
+    -------
+    values : ndarray of float64, shape (numbers, n)
+        One line for each column of numbers, NaN where void.
+    stamps : ndarray of int64, shape (n,)
+        Whole numbers of time, or nanoseconds since 1970 for `ISO`; the least integer where void.
+    stop : int
+        Where the first row that is not plain begins, or the end.
+    """
+    values = np.empty((int(np.count_nonzero(roles == NUMBER)), rows))
+    stamps = np.empty(rows, dtype=np.int64)
+    n, stop = _read_rows(text, start, roles, separator, point, digits, values, stamps)
+    if 2 * n < rows:  # a short part must not keep the room of a long one
+        return values[:, :n].copy(), stamps[:n].copy(), int(stop)
+    return values[:, :n], stamps[:n], int(stop)
+
+
+@njit(**KERNEL)
+def clean_column(values, factor, offset):  # type: ignore[no-untyped-def]
+    """Convert in place, ``values * factor + offset``, what is not finite to NaN.
+
+    Returns
+    -------
+    missing : int
+        Values that are not finite.
+    low, high : float
+        Range of the others, before conversion; infinite without any.
+    whole : bool
+        Whether they are whole numbers.
+    """
+    missing, low, high, whole = np.int64(0), np.inf, -np.inf, True
+    same = factor == 1.0 and offset == 0.0
+    for i in range(len(values)):
+        value = values[i]
+        if not math.isfinite(value):
+            missing += 1
+            values[i] = np.nan
+            continue
+        low, high = min(low, value), max(high, value)
+        if whole:
+            whole = value == np.rint(value)
+        if not same:
+            values[i] = value * factor + offset
+    return missing, low, high, whole
