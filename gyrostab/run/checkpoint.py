@@ -23,6 +23,7 @@ __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
 
 _MAGIC = b"GYROBLK1"
 _ALIGN = 64
+_SMALL = 2**26  # bytes of blocks up to which a product is put together in memory
 _CHUNK = 2**17  # values in one compressed chunk of a product: `gyrostab.export`
 
 
@@ -149,7 +150,7 @@ def _verified(path: Path) -> bytes:
 
 
 def assemble(blocks: Sequence[Block]) -> xr.Dataset:
-    """Put blocks together to one dataset, whose long variables are read from the files when they are used.
+    """Put blocks together to one dataset; where that is large, its long variables are read from the files when they are used.
 
     Parameters
     ----------
@@ -159,15 +160,17 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        The product: coordinates in memory, the rest dask arrays in the chunks of the file that will be written.
+        The product: coordinates in memory, and the rest too where all of it is small; otherwise dask arrays in the chunks of the
+        file that will be written.
     """
     first = blocks[0].header
+    small = sum(block.path.stat().st_size for block in blocks) <= _SMALL
     variables: dict[str, xr.Variable] = {}
     for name, described in first["variables"].items():
         dims, attrs = tuple(described["dims"]), _from_json(described["attrs"])
         if "time" not in dims:
             data = _section(blocks[0], name)
-        elif name in first["coords"]:
+        elif small or name in first["coords"]:
             data = np.concatenate([_section(block, name) for block in blocks], axis=dims.index("time"))
         else:
             data = _lazily(blocks, name)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.store.lock import library_lock
 
-__all__ = ["ChunkDamage", "is_readable", "read_chunk", "stored_attribute"]
+__all__ = ["ChunkDamage", "decoded_chunk", "is_readable", "read_chunk", "stored_attribute", "zarr_codecs"]
 
 #: Variables of files whose layout is remembered: some for each file of a long archive.
 _REMEMBERED = 2**12
@@ -120,10 +120,7 @@ def _hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> N
             os.close(handle)
         if len(data) < size:
             raise ChunkDamage("is missing: the file is cut short")
-        for number, codec in layout.codecs:
-            if not mask >> number & 1:
-                data = codec.decode(data)
-        return np.frombuffer(data, layout.dtype)
+        return decoded_chunk(data, [codec for number, codec in layout.codecs if not mask >> number & 1], layout.dtype)
     except OSError as error:
         if error.errno not in (None, errno.EIO):
             raise FormatError(f"{path}: cannot be opened again ({error.strerror}); has it been moved or changed?") from error
@@ -190,10 +187,7 @@ def _zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]
     layout = _zarr_layout(folder, opened)
     name = layout.separator.join(map(str, place))
     try:
-        data = (folder / name).read_bytes()
-        for codec in layout.codecs:
-            data = codec.decode(data)
-        return np.frombuffer(data, layout.dtype)
+        return decoded_chunk((folder / name).read_bytes(), layout.codecs, layout.dtype)
     except FileNotFoundError as error:
         if not folder.is_dir():
             raise FormatError(f"{folder}: is not there any more; has it been moved or removed?") from error
@@ -207,11 +201,22 @@ def _zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]
 @lru_cache(maxsize=_REMEMBERED)
 def _zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
     """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk."""
-    import numcodecs
-
     try:
         layout = json.loads((folder / ".zarray").read_text())
     except OSError as error:
         raise FormatError(f"{folder}: is not there any more ({error.strerror}); has it been moved or removed?") from error
-    codecs = tuple(numcodecs.get_codec(item) for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item)
-    return _ZarrLayout(np.dtype(layout["dtype"]), codecs, layout.get("dimension_separator", "."))
+    return _ZarrLayout(np.dtype(layout["dtype"]), zarr_codecs(layout), layout.get("dimension_separator", "."))
+
+
+def zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
+    """Compressor and filters of a variable as codecs, in the order of reading."""
+    import numcodecs
+
+    return tuple(numcodecs.get_codec(item) for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item)
+
+
+def decoded_chunk(data: Any, codecs: Iterable[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Bytes of a chunk, through the codecs, as numbers."""
+    for codec in codecs:
+        data = codec.decode(data)
+    return np.frombuffer(data, dtype)

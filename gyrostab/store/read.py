@@ -19,6 +19,7 @@ from gyrostab.cf import declared_grids, decode_stamps, index_dim
 from gyrostab.errors import FormatError
 from gyrostab.kernels.counts import from_counts
 from gyrostab.store.direct import with_fill
+from gyrostab.store.header import Header, read_header
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.timegrid import grid_times
 
@@ -45,6 +46,12 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     """
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
+    header = read_header(path)
+    if header is not None:
+        stored = _decoded(header)
+        long = _long_variables(stored, path, strict=strict)
+        if header.long <= long.keys():
+            return _lazy(stored, long, small=_SMALL)
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
@@ -60,6 +67,14 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     if is_log:
         stored.close()  # opened again where needed: no archive of any length holds more than a few files open
     return opened
+
+
+def _decoded(header: Header) -> xr.Dataset:
+    """What xarray makes of a header: text, missing values and factors decoded, times not, no index."""
+    decoded, attrs, names = xr.conventions.decode_cf_variables(header.variables, header.attrs, decode_times=False)
+    coords = {name: variable for name, variable in decoded.items() if name in names or (name,) == variable.dims}
+    data = {name: variable for name, variable in decoded.items() if name not in coords}
+    return xr.Dataset(data, xr.Coordinates(coords, indexes={}), attrs)
 
 
 def _lazy(stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int) -> xr.Dataset:

@@ -1,0 +1,102 @@
+"""What stands in a Zarr log beside its long variables, read in one look: attributes, dimensions, small variables.
+
+xarray and the library below it take three times as long, which is felt where an archive has hundreds of logs. Only what gyrostab writes
+is understood here; for all else, damage included, the answer is nothing, and xarray has its say. (A NetCDF file gains nothing by
+this: looking up its attributes is what takes the time, by whatever library.)
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.store.layout import decoded_chunk, zarr_codecs
+
+__all__ = ["Header", "read_header"]
+
+
+class Header(NamedTuple):
+    """A log as it lies on disk.
+
+    Attributes
+    ----------
+    variables : dict
+        Variables, not decoded; those of `long` without their values.
+    attrs : dict
+        Attributes of the file.
+    long : set of str
+        Variables along time, of which there is only shape, type and encoding.
+    """
+
+    variables: dict[str, xr.Variable]
+    attrs: dict[str, Any]
+    long: set[str]
+
+
+def read_header(path: Path) -> Header | None:
+    """Look at a log that gyrostab wrote; None when it is something else, or in any way not as expected."""
+    try:
+        header = _look(path) if path.is_dir() else None
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    if header is None or header.attrs.get("gyrostab_content") != "log" or "gyrostab_version" not in header.attrs:
+        return None
+    return header if "axis" in header.variables else None
+
+
+def _is_long(dims: tuple[str, ...], attrs: dict[str, Any], dtype: np.dtype[Any], chunks: Any, shape: tuple[int, ...]) -> bool:
+    """Whether `gyrostab.store.read` reads the variable chunk by chunk."""
+    doubles = dtype.kind == "f" or (dtype.kind in "iu" and "scale_factor" in attrs)
+    return bool(dims and dims[-1].startswith("time") and doubles and chunks and 0 not in shape)
+
+
+def _nothing(dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Stands for values that are read later; takes no memory."""
+    return np.broadcast_to(np.zeros((), dtype), shape)
+
+
+def _look(folder: Path) -> Header:
+    described = json.loads((folder / ".zmetadata").read_bytes())["metadata"]
+    variables: dict[str, xr.Variable] = {}
+    long: set[str] = set()
+    for key, layout in described.items():
+        name, _, kind = key.rpartition("/")
+        if kind != ".zarray" or not name:
+            continue
+        attrs = dict(described.get(f"{name}/.zattrs", {}))
+        dims, shape, chunks = (tuple(found) for found in (attrs.pop("_ARRAY_DIMENSIONS"), layout["shape"], layout["chunks"]))
+        dtype = np.dtype(layout["dtype"])
+        if layout["order"] != "C":
+            raise ValueError("order")
+        if layout["fill_value"] is not None:
+            attrs["_FillValue"] = dtype.type(layout["fill_value"])
+        encoding = {"chunks": chunks, "preferred_chunks": dict(zip(dims, chunks, strict=True)), "dtype": dtype}
+        if _is_long(dims, attrs, dtype, chunks, shape):
+            long.add(name)
+            values = _nothing(dtype, shape)
+        else:
+            values = _values(folder / name, layout, shape, chunks, dtype)
+        variables[name] = xr.Variable(dims, values, attrs, encoding)
+    return Header(variables, dict(described.get(".zattrs", {})), long)
+
+
+def _values(folder: Path, layout: dict[str, Any], shape: tuple[int, ...], chunks: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    if len(shape) > 1:
+        raise ValueError("dimensions")
+    codecs = zarr_codecs(layout)
+    if not shape:
+        return decoded_chunk((folder / "0").read_bytes(), codecs, dtype)[:1].reshape(())
+    pieces = [decoded_chunk((folder / str(n)).read_bytes(), codecs, dtype) for n in range(-(-shape[0] // chunks[0]) if shape[0] else 0)]
+    return _whole(pieces, shape[0], chunks[0], dtype)
+
+
+def _whole(pieces: list[NDArray[Any]], size: int, length: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Chunks of `length` values put together to `size`."""
+    if any(piece.size != length for piece in pieces):
+        raise ValueError("size")
+    return np.concatenate([np.empty(0, dtype), *pieces])[:size]
