@@ -1,0 +1,81 @@
+"""Samples that Gaussian noise does not have: outliers, repeats, clipped or empty values, heavy or missing tails."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.views.cells import Array, over_windows, values_of, view_dataset, window_set
+
+__all__ = ["COUNTS", "LENGTHS", "score"]
+
+#: Lengths of the windows [blocks]; the record as a whole is one more.
+LENGTHS = (1, 5, 15)
+#: What is counted.
+COUNTS = ("outliers", "repeats", "extremes", "zeros")
+_MOST = 4.0  # what the kurtosis of one block may say: a single outlier is for the counts to judge
+#: Least scatter of the scores: where null records never count one, a single one is no mismatch. Two extremes every record has.
+_FLOOR = (0.35, 0.35, 0.7, 0.35, 0.2)
+
+
+def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+    """Score counts and kurtosis in windows of three lengths and of the whole record.
+
+    The counts are made to scatter alike by Anscombe's root; what is to be expected of them the null records say, so that
+    only differences between records of one kind mean something.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        Recording or null records; nothing of the baseline is used.
+
+    Returns
+    -------
+    xarray.Dataset
+        See `gyrostab.diagnose.views.cells.view_dataset`. ``ratio`` and ``estimate`` are the count, or the mean kurtosis.
+    """
+    windows = window_set(reduced.sizes["block"], LENGTHS)
+    samples = values_of(reduced, "samples", "axis", "block").astype(float)
+    counts = np.stack([np.nan_to_num(values_of(reduced, name, "axis", "block").astype(float)) for name in COUNTS], axis=-1)
+    counts = over_windows(counts, windows)
+    heavy, used = kurtosis_score(values_of(reduced, "kurtosis", "axis", "block"), samples)
+    heavy = np.clip(heavy, -_MOST, _MOST)
+    n = over_windows(used[..., None], windows)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tails = np.where(n > 0, over_windows(heavy[..., None], windows) / np.sqrt(n), np.nan)
+        excess = np.where(used > 0, np.nan_to_num(values_of(reduced, "kurtosis", "axis", "block")), 0.0)
+        mean = over_windows(excess[..., None], windows) / n
+    rate = float(reduced.attrs["sampling_rate_hz"])
+    number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
+    return view_dataset(
+        "distribution",
+        reduced,
+        rows=[str(axis) for axis in reduced["axis"].values],
+        windows=windows,
+        columns={"what": [*COUNTS, "kurtosis"], "tau_min_s": 1.0 / rate, "tau_max_s": 1.0 / rate, "floor": _FLOOR},
+        z=np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1),
+        ratio=number,
+        estimate=number,
+    )
+
+
+def kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
+    """Normal score of the excess kurtosis of so many Gaussian samples (Anscombe and Glynn 1983), and 1 where there is one.
+
+    Examples
+    --------
+    >>> z, used = kurtosis_score(np.array([0.0, 0.5]), np.array([2000.0, 2000.0]))
+    >>> z.round(1)
+    array([0.1, 3.7])
+    """
+    n = np.maximum(samples, 4.0)
+    mean = -6.0 / (n + 1.0)
+    variance = 24.0 * n * (n - 2.0) * (n - 3.0) / ((n + 1.0) ** 2 * (n + 3.0) * (n + 5.0))
+    skew = 6.0 * (n * n - 5.0 * n + 2.0) / ((n + 7.0) * (n + 9.0)) * np.sqrt(6.0 * (n + 3.0) * (n + 5.0) / (n * (n - 2.0) * (n - 3.0)))
+    a = 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
+    used = np.isfinite(excess) & (samples >= 20)
+    with np.errstate(invalid="ignore"):
+        x = np.where(used, (excess - mean) / np.sqrt(variance), 0.0)
+        base = 1.0 + x * np.sqrt(2.0 / (a - 4.0))
+        z = ((1.0 - 2.0 / (9.0 * a)) - np.cbrt((1.0 - 2.0 / a) / np.maximum(base, 1e-9))) / np.sqrt(2.0 / (9.0 * a))
+    return np.where(used, z, 0.0), used.astype(float)

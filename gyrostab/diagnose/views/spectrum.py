@@ -1,0 +1,94 @@
+"""Lines that stand out of the spectrum around them."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.views.cells import Array, Windows, cube_root_score, values_of, view_dataset
+
+__all__ = ["score"]
+
+_NEAR = 2  # lines on either side that a line leaks into
+_AROUND = 40  # lines on either side that tell the level
+
+
+def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+    """Score every line of the full-resolution spectrum, in parts of the record and in the whole, against its surroundings.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        Recording or null records, and what the simulation expects: its spectrum gives the slope of the surroundings, their
+        level is the recording's own.
+
+    Returns
+    -------
+    xarray.Dataset or None
+        None without lines. ``estimate`` is the amplitude of a sine that would raise the line so far [degree hour-1].
+    """
+    if "line_power" not in reduced:
+        return None
+    power, weight = values_of(reduced, "line_power", "axis", "part", "line"), values_of(reduced, "line_weight", "axis", "part")
+    frequency = reduced["line_frequency"].values
+    windows = _parts(reduced)
+    flat = power / _expected(baseline, frequency)[:, None, :]
+    there = np.isfinite(flat) & (weight > 0)[..., None]
+    each = np.where(there, weight[..., None], 0.0)
+    flat = np.where(there, flat, 0.0) * each
+    with np.errstate(divide="ignore", invalid="ignore"):
+        whole = flat.sum(axis=-2, keepdims=True)
+        count = np.concatenate([each, each.sum(axis=-2, keepdims=True)], axis=-2)
+        flat = np.concatenate([flat, whole], axis=-2) / count
+        around = _surroundings(flat)
+        ratio = flat / around
+    excess = _near(flat - around) * _expected(baseline, frequency)[:, None, :]
+    z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND)))
+    half = 0.371 / frequency  # where the Allan variance of a sine is largest
+    return view_dataset(
+        "spectrum",
+        reduced,
+        rows=[str(axis) for axis in reduced["axis"].values],
+        windows=windows,
+        columns={"what": "line", "tau_min_s": half, "tau_max_s": half, "frequency": frequency},
+        z=z,
+        ratio=ratio,
+        estimate=2.0 * np.sqrt(np.maximum(excess, 0.0) / float(reduced.attrs["block_s"])),
+        units="degree hour-1",
+        one_sided=True,
+    )
+
+
+def _parts(reduced: xr.Dataset) -> Windows:
+    """Blocks of the equal parts of the record, and of the whole last."""
+    parts, blocks = reduced.sizes["part"], reduced.sizes["block"]
+    edge = np.rint(np.linspace(0, blocks, parts + 1)).astype(np.int64)
+    return Windows(np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), blocks))
+
+
+def _expected(baseline: xr.Dataset, frequency: Array) -> Array:
+    """Mean spectrum of the baseline at the lines, by axis."""
+    spectrum = baseline["spectrum"].mean("block").transpose("axis", "band").values
+    bands = np.log(baseline["frequency"].values)
+    return np.stack([np.exp(np.interp(np.log(frequency), bands, np.log(row))) for row in spectrum])
+
+
+def _near(excess: Array) -> Array:
+    """Sum over a line and those it leaks into; of a sine, a quarter of the squared amplitude times the block."""
+    n = excess.shape[-1]
+    total = np.concatenate([np.zeros((*excess.shape[:-1], 1)), np.cumsum(excess, axis=-1)], axis=-1)
+    place = np.arange(n)
+    return np.asarray(total[..., np.minimum(place + _NEAR + 1, n)] - total[..., np.maximum(place - _NEAR, 0)])
+
+
+def _surroundings(flat: Array) -> Array:
+    """Mean of the lines around each, without those next to it; nearer the ends, of as many from within."""
+    n = flat.shape[-1]
+    total = np.concatenate([np.zeros((*flat.shape[:-1], 1)), np.cumsum(flat, axis=-1)], axis=-1)
+    place = np.arange(n)
+    wide = min(2 * _AROUND + 2 * _NEAR + 1, n)
+    low = np.clip(place - wide // 2, 0, n - wide)
+    near_low, near_high = np.maximum(place - _NEAR, 0), np.minimum(place + _NEAR + 1, n)
+    inner = total[..., near_high] - total[..., near_low]
+    outer = total[..., low + wide] - total[..., low]
+    return np.asarray((outer - inner) / np.maximum(wide - (near_high - near_low), 1))

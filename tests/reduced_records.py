@@ -1,0 +1,121 @@
+"""Reduced records drawn from their laws: gamma powers, normal means, independent axes; and the baseline that knows them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.noise import TERMS
+
+RATE, BLOCK_S, PARTS = 100.0, 20.0, 8
+
+
+def frame(*, blocks: int = 180, missing: float = 0.0, rate: float = RATE, block_s: float = BLOCK_S) -> dict[str, Any]:
+    """Bands, shapes and edges that all records share."""
+    half = int(block_s * rate / 2)
+    edges = np.unique(np.round(np.geomspace(1, half, 15)).astype(int))
+    edges[-1] += 1
+    step = 1.0 / block_s
+    return {
+        "low": (edges[:-1] - 0.5) * step,
+        "high": (edges[1:] - 0.5) * step,
+        "shape": 0.86 * np.diff(edges) * (1.0 - missing),
+        "lines": np.arange(1, half + 1) * step,
+        "blocks": blocks,
+        "rate": rate,
+        "block_s": block_s,
+        "samples": round(block_s * rate * (1.0 - missing)),
+    }
+
+
+def baseline(*, axes: str = "xyz", noise: float = 0.003, flicker: float = 0.0, walk: float = 0.0, **options: Any) -> xr.Dataset:
+    """White noise of `noise` deg/sqrt(h) on every axis, flicker of `flicker` deg/h, a walk of `walk` deg/h^1.5."""
+    f = frame(**options)
+    level = 3600.0 * noise**2
+    coefficient = np.zeros((len(axes), len(TERMS)))
+    for term, value in (("N", noise), ("B", flicker), ("K", walk)):
+        coefficient[:, TERMS.index(term)] = value
+    frequency = (f["low"] + f["high"]) / 2.0
+    spectrum = level + flicker**2 / (2 * np.pi * frequency) + (walk / 60.0 / (2 * np.pi * frequency)) ** 2
+    shape = (len(axes), f["blocks"])
+    return xr.Dataset(
+        {
+            "spectrum": (("axis", "block", "band"), np.broadcast_to(spectrum, (*shape, frequency.size)).copy()),
+            "known_mean": (("axis", "block"), np.zeros(shape)),
+            "mean_variance": (("axis", "block"), np.full(shape, level * f["rate"] / f["samples"])),
+            "coefficient": (("axis", "term"), coefficient),
+        },
+        coords={"axis": list(axes), "term": list(TERMS), "frequency": ("band", frequency)},
+    )
+
+
+def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: Any) -> xr.Dataset:
+    """`count` records without any effect, by ``record``."""
+    f = frame(**options)
+    axes, blocks = base.sizes["axis"], f["blocks"]
+    spectrum, shape = base["spectrum"].values, np.broadcast_to(f["shape"], base["spectrum"].shape)
+    power = spectrum * rng.gamma(np.broadcast_to(shape, (count, *shape.shape))) / shape
+    pairs = [(a, b) for a in range(axes) for b in range(a + 1, axes)]
+    cross = [_cross(power[:, a], power[:, b], shape[a], rng) for a, b in pairs]
+    weight = np.full((axes, PARTS), blocks / PARTS)
+    density = np.stack([np.interp(f["lines"], base["frequency"], row) for row in spectrum[:, 0]])
+    lines = density[:, None] * rng.gamma(weight[0, 0], size=(count, axes, PARTS, f["lines"].size)) / weight[0, 0]
+    plane, cube = ("record", "axis", "block"), ("record", "axis", "block", "band")
+    names = [str(axis) for axis in base["axis"].values]
+    data: dict[str, Any] = {
+        "mean": (plane, _means(base, count, rng, f)),
+        "samples": (("axis", "block"), np.full((axes, blocks), f["samples"])),
+        "power": (cube, power),
+        "shape": (("axis", "block", "band"), shape),
+        "line_power": (("record", "axis", "part", "line"), lines),
+        "line_weight": (("axis", "part"), weight),
+        "kurtosis": (plane, rng.normal(0.0, np.sqrt(24.0 / f["samples"]), (count, axes, blocks))),
+    }
+    if pairs:
+        data["cross"] = (("record", "pair", "block", "band"), np.stack(cross, axis=1))
+    for name in ("outliers", "repeats", "extremes", "zeros"):
+        data[name] = (plane, rng.poisson(1e-5, (count, axes, blocks)))
+    edges = np.arange(blocks + 1) * f["block_s"]
+    coords = {
+        "axis": names,
+        "begin": ("block", edges[:-1]),
+        "end": ("block", edges[1:]),
+        "frequency": base["frequency"],
+        "band_low": ("band", f["low"]),
+        "band_high": ("band", f["high"]),
+        "line_frequency": ("line", f["lines"]),
+        "first": ("pair", [names[a] for a, _ in pairs]),
+        "second": ("pair", [names[b] for _, b in pairs]),
+    }
+    attrs = {"sampling_rate_hz": f["rate"], "block_s": f["block_s"], "start_ns": 1_790_000_000_000_000_000}
+    return xr.Dataset(data, coords=coords, attrs=attrs)
+
+
+def chunks(base: xr.Dataset, count: int, rng: np.random.Generator, *, size: int = 25, **options: Any):
+    """Null records, `size` at a time."""
+    for _ in range(count // size):
+        yield records(base, size, rng, **options)
+
+
+def _cross(first: np.ndarray, second: np.ndarray, shape: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Cross-periodogram of independent axes, given their powers: the coherency squared is Beta(1, n - 1)."""
+    squared = rng.beta(1.0, np.maximum(shape - 1.0, 1e-9), first.shape)
+    return np.sqrt(first * second * squared) * np.exp(2j * np.pi * rng.random(first.shape))
+
+
+def _means(base: xr.Dataset, count: int, rng: np.random.Generator, f: dict[str, Any]) -> np.ndarray:
+    """White noise, a random walk, and flicker noise as the sum of relaxing processes over six octaves of four."""
+    axes, blocks = base.sizes["axis"], f["blocks"]
+    mean = rng.normal(size=(count, axes, blocks)) * np.sqrt(base["mean_variance"].values)
+    walk, flicker = (float(base["coefficient"].sel(term=term)[0]) for term in ("K", "B"))
+    mean += np.cumsum(rng.normal(0.0, walk * np.sqrt(f["block_s"] / 3600.0), mean.shape), axis=-1)
+    if flicker:
+        for time in 10.0 * 2.0 ** np.arange(14):
+            keep = np.exp(-f["block_s"] / time)
+            state = rng.normal(size=mean.shape[:-1])
+            for block in range(blocks):
+                mean[..., block] += flicker * np.sqrt(np.log(2.0) / np.pi) * state
+                state = keep * state + np.sqrt(1 - keep**2) * rng.normal(size=state.shape)
+    return mean
