@@ -23,7 +23,9 @@ __all__ = [
     "RESTART",
     "STARTED",
     "STEP",
+    "look",
     "new_state",
+    "piece_sums",
     "place",
     "track",
 ]
@@ -94,6 +96,96 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
         count[i] = count[i - 1] + k
         phase = (1.0 - gain) * (step + phase - k * period)
     return count, piece
+
+
+@njit(**KERNEL)
+def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
+    """Sums of straight lines through the pieces of a stretch, stamp over count.
+
+    Parameters
+    ----------
+    stamps, count, piece : ndarray of int64, shape (n,)
+        Stamps [ns]; sample numbers and numbers of the piece, from `track`.
+    period : float
+        Slope [ns] of a piece of one stamp.
+
+    Returns
+    -------
+    ndarray, shape (pieces, 6)
+        Stamps in the piece, mean count, mean stamp [ns from the first of the stretch], sums of squares of the counts and of counts times
+        stamps about their means, and of the residuals.
+    """
+    n = len(stamps)
+    pieces = np.int64(n > 0)
+    for i in range(1, n):
+        pieces += piece[i] != piece[i - 1]
+    table = np.empty((pieces, 6))
+    begin = np.int64(0)
+    for row in range(pieces):
+        end = begin + 1
+        while end < n and piece[end] == piece[begin]:
+            end += 1
+        count0, stamp0, size = count[begin], stamps[begin], end - begin
+        mean_count = mean_stamp = 0.0
+        for i in range(begin, end):
+            mean_count += count[i] - count0
+            mean_stamp += stamps[i] - stamp0
+        mean_count, mean_stamp = mean_count / size, mean_stamp / size
+        squares = products = rest = 0.0
+        for i in range(begin, end):
+            c, t = count[i] - count0 - mean_count, stamps[i] - stamp0 - mean_stamp
+            squares += c * c
+            products += c * t
+        slope = products / squares if squares > 0.0 else period
+        for i in range(begin, end):
+            rest += (stamps[i] - stamp0 - mean_stamp - slope * (count[i] - count0 - mean_count)) ** 2
+        table[row, 0], table[row, 1], table[row, 2] = size, mean_count + count0, mean_stamp + (stamp0 - stamps[0])
+        table[row, 3], table[row, 4], table[row, 5] = squares, products, rest
+        begin = end
+    return table
+
+
+@njit(**KERNEL)
+def look(cells, present):  # type: ignore[no-untyped-def]
+    """Look at every cell once.
+
+    Parameters
+    ----------
+    cells : ndarray, shape (n_axes, n)
+        Values by axis and row.
+    present : ndarray of bool, shape (n,)
+        Set where any axis has a number (or infinity).
+
+    Returns
+    -------
+    absent : int
+        Rows without any number.
+    holes, infinite : int
+        Cells that are no number in other rows, and infinite cells.
+    low, high : ndarray, shape (n_axes,)
+        Range of the finite values; infinite without any.
+    """
+    axes, n = cells.shape
+    low, high = np.full(axes, np.inf), np.full(axes, -np.inf)
+    present[:] = False
+    nans = infinite = np.int64(0)
+    for axis in range(axes):
+        least, most = np.inf, -np.inf
+        for row in range(n):
+            value = cells[axis, row]
+            if np.isfinite(value):
+                least, most = min(least, value), max(most, value)
+                present[row] = True
+            elif np.isnan(value):
+                nans += 1
+            else:
+                infinite += 1
+                present[row] = True
+        low[axis], high[axis] = least, most
+    absent = np.int64(0)
+    for row in range(n):
+        absent += not present[row]
+    return absent, nans - axes * absent, infinite, low, high
 
 
 @njit(**INNER)
@@ -232,11 +324,35 @@ def _note(events, n, cause, sample, row, before, stamp):  # type: ignore[no-unty
     return n + 1
 
 
+@njit(**INNER)
+def _on_time(rows, stamps, j, n, period, hold, state, ring):  # type: ignore[no-untyped-def]
+    """Place rows as long as each is the one after the last and on time for the next sample; the first that is not."""
+    head, row, latest, phase = state[_HEAD], state[_ROW], state[_LATEST], state[_PHASE]
+    grid0, stamp0, begin = state[_GRID0], state[_STAMP0], j
+    if not state[STARTED] or state[_PENDING]:
+        return j
+    while j < n and rows[j] == row + 1 and stamps[j] != NO_STAMP:
+        ahead = grid0 - phase * _UNIT + (stamps[j] - stamp0) / period - (head + 1)
+        if abs(ahead) > 0.5 or abs(phase * _UNIT) > hold:
+            break
+        phase += int(_GAIN * ahead / _UNIT)
+        head, row, latest = head + 1, row + 1, max(latest, stamps[j])
+        ring[head & (len(ring) - 1)] = True
+        j += 1
+    state[_HEAD], state[_ROW], state[_LATEST], state[_PHASE] = head, row, latest, phase
+    state[_RUN_LENGTH] += j - begin
+    return j
+
+
 @njit(**KERNEL)
 def _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  # type: ignore[no-untyped-def]
     """`place` into `runs` and `events`; returns how many there are of each."""
     n_runs, n_events = np.int64(0), np.int64(0)
-    for j in range(n):
+    j = np.int64(-1)
+    while True:
+        j = _on_time(rows, stamps, j + 1, n, period, hold, state, ring)
+        if j >= n:
+            break
         row, stamp = rows[j], stamps[j]
         if stamp == NO_STAMP:
             if state[STARTED] and (state[_ROW] + 1 + state[_PENDING] == row):

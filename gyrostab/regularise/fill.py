@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.stamps import NO_STAMP, RESTART, STEP
 from gyrostab.regularise.place import Placement
-from gyrostab.regularise.survey import BLOCK
+from gyrostab.regularise.survey import BLOCK, in_memory
 from gyrostab.timegrid import grid_times
 
 __all__ = ["SMALL", "gathered", "on_grid", "samples_of"]
@@ -105,13 +105,13 @@ def gathered(raw: xr.Dataset, name: str, placement: Placement, rate: float) -> t
     moved = np.concatenate([[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]])
     stamps, values = [], []
     for begin in range(0, channel.shape[0], BLOCK):
-        block = np.asarray(channel[begin : begin + BLOCK], dtype=np.float64)
+        block = in_memory(channel[begin : begin + BLOCK]).astype(np.float64, copy=False)
         rows = np.flatnonzero(np.isfinite(block))
         sample = samples_of(placement, rows + begin)
         known = sample >= 0
         when = grid_times(placement.start, rate, sample)
         if clock is not None and not known.all():
-            written = np.asarray(clock[begin : begin + BLOCK]).astype("datetime64[ns]").view(np.int64)[rows]
+            written = in_memory(clock[begin : begin + BLOCK]).astype("datetime64[ns]").view(np.int64)[rows]
             own = written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
             when = np.where(known, when, own)
             known |= written != NO_STAMP

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
-from gyrostab.kernels.stamps import NO_STAMP, track
+from gyrostab.kernels.stamps import NO_STAMP, piece_sums, track
 
 __all__ = ["RateEstimate", "Stamps", "estimate_rate", "odd_stretches", "starting_period"]
 
@@ -203,7 +202,7 @@ def _longest(parts: list[NDArray[np.int64]], period: float) -> float:
 
 def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest: float) -> NDArray[np.float64]:
     """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
-    table: list[tuple[float, ...]] = []
+    table = np.empty((0, 6))
     zero: int | None = None
     for _, block in stamps():
         known = np.flatnonzero(block != NO_STAMP)
@@ -218,18 +217,13 @@ def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest:
             count, piece = track(block, period, _GAIN, longest)
         if coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1:  # only there the true time is known
             block, count, piece = block[tick], count[tick], piece[tick]
-        edges = np.concatenate([[0], np.flatnonzero(np.diff(piece)) + 1, [len(block)]])
-        for a, b in pairwise(edges):
-            c, t = count[a:b].astype(np.float64), (block[a:b] - zero).astype(np.float64)
-            mc, mt = c.mean(), t.mean()
-            c, t = c - mc, t - mt
-            cc, ct = c @ c, c @ t
-            rest = t - (ct / cc if cc else period) * c
-            table.append((b - a, mc, mt, cc, ct, rest @ rest))
+        sums = piece_sums(block, count, piece, period)
+        sums[:, 2] += block[0] - zero if len(block) else 0
+        table = np.concatenate([table, sums])
         if len(table) > _MAX_PIECES:  # a log in shreds: the largest pieces tell the rate
-            table = sorted(table, key=lambda row: -row[3])[: _MAX_PIECES // 2]
-            table.sort(key=lambda row: row[2])
-    return np.array(table, dtype=np.float64)
+            table = table[np.argsort(-table[:, 3], kind="stable")[: _MAX_PIECES // 2]]
+            table = table[np.argsort(table[:, 2], kind="stable")]
+    return table
 
 
 def _pooled(pieces: NDArray[np.float64], period: float, counted: bool) -> tuple[float, float, float]:
@@ -338,14 +332,20 @@ def odd_stretches(stamps: Stamps, period: float, *, size: int = 1024) -> list[tu
     for rows, values in _recut(stamps, 64 * size):
         known = values != NO_STAMP
         rows, values = rows[known], values[known]
-        for begin in range(0, len(values), size):
+        for begin, pace in _paces(values, size):
             part = values[begin : begin + size]
-            if len(part) < size // 4:
-                break
-            pace = float(np.median(np.diff(part[::16]))) / 16
             own = None if abs(pace / period - 1) < 0.02 else _on_a_line([part])
             odd = own is not None and abs(own / period - 1) > 0.02
             if odd and not inside and own is not None:
                 found.append((int(rows[begin]), int(part[0]), SECOND / own))
             inside = odd
     return found
+
+
+def _paces(values: NDArray[np.int64], size: int) -> Iterator[tuple[int, float]]:
+    """First row of every stretch of `size` stamps (the last may be shorter), and how far apart its stamps are as a rule [ns]."""
+    whole = len(values) // size
+    paces = np.median(np.diff(values[: whole * size].reshape(whole, size)[:, ::16], axis=1), axis=1) / 16 if whole else []
+    yield from ((place * size, float(pace)) for place, pace in enumerate(paces))
+    if len(values) - whole * size >= size // 4:
+        yield whole * size, float(np.median(np.diff(values[whole * size :: 16]))) / 16

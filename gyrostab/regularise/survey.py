@@ -5,14 +5,16 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
+from gyrostab.kernels.stamps import look
 
-__all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
+__all__ = ["BLOCK", "Survey", "blocks", "file_of", "in_memory", "survey"]
 
 #: Rows that are held in memory at one time.
 BLOCK = 1 << 20
@@ -52,6 +54,11 @@ class Survey:
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
+def in_memory(values: Any) -> NDArray[Any]:
+    """A part of a column, computed here if it is lazy: handing it to threads takes longer than reading it."""
+    return np.asarray(values.compute(scheduler="synchronous") if hasattr(values, "compute") else values)
+
+
 def _spans(bad: NDArray[np.bool_], offset: int) -> NDArray[np.int64]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
@@ -85,18 +92,18 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
     filled = dict.fromkeys(channels, 0)
     for begin in range(0, rows, block):
         end = min(rows, begin + block)
-        cells = np.asarray(signal[:, begin:end])
-        nan = np.isnan(cells)
-        present = ~nan.all(axis=0)
-        absent += int((~present).sum())
+        cells = in_memory(signal[:, begin:end])
+        present = np.empty(end - begin, dtype=bool)
+        missing, holes, infinities, least, most = look(np.ascontiguousarray(cells, dtype=np.float64), present)
+        absent += missing
         bits.append(np.packbits(present))
-        unreadable.append(_spans(nan.any(axis=0) & present, begin))
-        infinity = np.isinf(cells)
-        infinite.append(_spans(infinity.any(axis=0), begin))
-        usable = np.where(nan | infinity, np.nan, cells)
-        low, high = np.fmin(low, np.fmin.reduce(usable, axis=1)), np.fmax(high, np.fmax.reduce(usable, axis=1))
+        if holes:
+            unreadable.append(_spans(np.isnan(cells).any(axis=0) & present, begin))
+        if infinities:
+            infinite.append(_spans(np.isinf(cells).any(axis=0), begin))
+        low, high = np.minimum(low, least), np.maximum(high, most)
         for key in channels:
-            filled[key] += int(np.isfinite(np.asarray(raw[key].data[begin:end])).sum())
+            filled[key] += int(np.isfinite(in_memory(raw[key].data[begin:end])).sum())
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
             f"{_sources(raw)}: none of the {rows} rows holds a number for any gyro axis; check the columns, the units and --map"
@@ -114,9 +121,12 @@ def blocks(
     stamps = raw["time"].data
     for begin in range(0, found.rows, block):
         end = min(found.rows, begin + block)
-        values = np.asarray(stamps[begin:end]).astype("datetime64[ns]").view(np.int64)
-        keep = np.ones(end - begin, dtype=bool) if all_rows else found.mask(begin, end)
-        yield np.flatnonzero(keep) + begin, values[keep]
+        values = in_memory(stamps[begin:end]).astype("datetime64[ns]", copy=False).view(np.int64)
+        if all_rows or found.absent == 0:
+            yield np.arange(begin, end), values
+        else:
+            keep = found.mask(begin, end)
+            yield np.flatnonzero(keep) + begin, values[keep]
 
 
 def _sources(raw: xr.Dataset) -> str:
