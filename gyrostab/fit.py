@@ -193,7 +193,7 @@ def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, he
     }
     if chosen.size == surface.sizes["tau"]:  # otherwise davar's own, for every averaging time, stands
         extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
-    return _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra, method="gls")
+    return _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra, method="gls")
 
 
 class _Tables:
@@ -315,8 +315,8 @@ def _assemble(
     errors: list[Any],
     limits: list[Any],
     observable: list[Any],
-    extra: dict[str, Any],
     *,
+    extra: dict[str, Any],
     method: str,
 ) -> xr.Dataset:
     plane = ("axis", "time")
@@ -352,4 +352,4 @@ def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64])
     seen = [np.where(np.isfinite(values[..., i]), 2, 0) for i in range(len(TERMS))]
     extra = {name: (("axis", "time"), nothing[0], attributes(name)) for name in ("fit_chi2", "fit_dof")}
     coefficients = [values[..., i] for i in range(len(TERMS))]
-    return _assemble(surface, coefficients, nothing, nothing, seen, extra, method="adev")
+    return _assemble(surface, coefficients, nothing, nothing, seen, extra=extra, method="adev")
