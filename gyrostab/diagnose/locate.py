@@ -254,7 +254,7 @@ def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:
     shared = min(one["end"], other["end"]) - max(one["begin"], other["begin"])
     together = max(one["end"], other["end"]) - min(one["begin"], other["begin"])
     overlap = min(one["tau_max_s"], other["tau_max_s"]) >= 0.99 * max(one["tau_min_s"], other["tau_min_s"])
-    return overlap and shared > 0.5 * together
+    return bool(overlap and shared > 0.5 * together)
 
 
 def _table(boxes: list[dict[str, Any]], reduced: xr.Dataset, null: NullScores, level: float) -> xr.Dataset:

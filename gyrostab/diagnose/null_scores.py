@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.views import VIEWS
 from gyrostab.errors import OptionError
 
-__all__ = ["NullScores", "Tail", "ViewNull", "null_scores", "standardise"]
+__all__ = ["NullScores", "Tail", "ViewNull", "null_scores", "smallest_p", "standardise"]
 
 Array = NDArray[np.float64]
 _BELOW = 1.4  # standard deviations below the largest of independent cells, from which on scores are kept
@@ -21,6 +21,7 @@ _FIRST = 20  # null records that tell what a standard deviation is
 _POOL = 100.0  # null records that the mean over like windows counts for
 _SHARE = 0.25  # of the null records, the largest, to which the tail is fitted
 _LEAST = 40
+_LEAST_P = 1e-9  # a tail from hundreds of records says nothing of rarer things
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,12 @@ class Tail:
     start: float
     scale: float
 
-    def p_value(self, value: Array | float) -> Array:
-        """Probability that the largest of a null record is `value` or more."""
+    def surprise(self, value: Array | float) -> Array:
+        """``-log`` of the probability that the largest of a null record is `value` or more."""
         value = np.asarray(value, dtype=float)
         rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (self.sample.size + 1.0)
-        beyond = _SHARE * np.exp(-np.maximum(value - self.start, 0.0) / self.scale)
-        return np.where(value > self.start, beyond, np.clip(rank, _SHARE, 1.0))
+        beyond = (value - self.start) / self.scale - np.log(_SHARE)
+        return np.where(value > self.start, beyond, -np.log(np.clip(rank, _SHARE, 1.0)))
 
     def level(self, p: float) -> float:
         """Value that the largest of a null record reaches with probability `p`."""
@@ -72,8 +73,8 @@ class NullScores:
 
     def p_value(self, view: str, z: Array | float) -> Array:
         """Probability that a null record has so large a standardised score in any view, as this one has in this view."""
-        p = self.views[view].tail.p_value(np.square(z) / 2.0)
-        return np.minimum(self.family.p_value(-np.log(p)), 1.0)
+        own = self.views[view].tail.surprise(np.square(z) / 2.0)
+        return np.asarray(np.clip(np.exp(-self.family.surprise(own)), _LEAST_P, 1.0))
 
     def critical(self, view: str, level: float) -> float:
         """Standardised score of a view at which the p-value is `level`."""
@@ -121,8 +122,32 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
         mean, spread, z = view.finish()
         half = z**2 / 2.0
         views[name] = ViewNull(mean, spread, _tail(half))
-        largest[name] = -np.log(views[name].tail.p_value(half))
+        largest[name] = views[name].tail.surprise(half)
     return NullScores(views, _tail(np.max(list(largest.values()), axis=0)), records)
+
+
+def smallest_p(reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores) -> Array:
+    """P-value of the largest score of a record over all views: the chance that a null record has one as large.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        A recording, or several by ``record``, and what the simulation expects.
+    null : NullScores
+        From `null_scores`.
+
+    Returns
+    -------
+    ndarray
+        One for each record; of no dimension for a recording.
+    """
+    p = []
+    for name, view in null.views.items():
+        scores = VIEWS[name](reduced, baseline)
+        if scores is not None:
+            z = np.abs(np.nan_to_num(standardise(scores, view))).max(axis=(-3, -2, -1))
+            p.append(null.p_value(name, z))
+    return np.min(p, axis=0)
 
 
 def standardise(scores: xr.Dataset, null: ViewNull) -> Array:

@@ -14,7 +14,7 @@ __all__ = ["LENGTHS", "allan_surface", "score", "transfer"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
-_FINE = 64  # points of the integral of the transfer function in one band
+_FINE = 256  # points of the integral of the transfer function in one band
 
 
 def transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
@@ -145,7 +145,8 @@ def _beyond(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict
             fits = (count >= 0.5 * pairs.length) & (pairs.length > 0) & (windows.length >= 4 * k)
             parts["observed"].append(over_windows(np.where(there, d2, 0.0)[..., None], pairs)[..., 0] / count)
             parts["expected"].append(over_windows(np.where(there, expected, 0.0)[..., None], pairs)[..., 0] / count)
-            parts["shape"].append(np.where(fits, _shape(count, k), np.nan))
+            table = _shape(np.arange(int(count.max(initial=0)) + 1), k)
+            parts["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
     if not sizes:
         nothing = np.empty((*means.shape[:-1], windows.first.size, 0))
         joined: dict[str, Any] = dict.fromkeys(parts, nothing)
@@ -185,7 +186,7 @@ def _slow(reduced: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
     return np.asarray(total)
 
 
-def _shape(count: Array, k: int) -> Array:
+def _shape(count: Any, k: int) -> Array:
     """Shape of the gamma law of the mean of `count` overlapping terms in white noise."""
     box = np.concatenate([-np.ones(k), np.ones(k)])
     r2 = (np.correlate(box, box, mode="full")[2 * k - 1 :] / (2 * k)) ** 2

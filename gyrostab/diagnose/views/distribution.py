@@ -66,7 +66,7 @@ def kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
     --------
     >>> z, used = kurtosis_score(np.array([0.0, 0.5]), np.array([2000.0, 2000.0]))
     >>> z.round(1)
-    array([0.1, 3.7])
+    array([0.1, 3.8])
     """
     n = np.maximum(samples, 4.0)
     mean = -6.0 / (n + 1.0)

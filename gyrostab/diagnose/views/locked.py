@@ -74,7 +74,7 @@ def _turning(reduced: xr.Dataset) -> Array:
     """Turns per second in each block."""
     if "channel_rotation_rate" not in reduced:
         return np.zeros(reduced.sizes["block"])
-    return np.nan_to_num(np.abs(reduced["channel_rotation_rate"].values) / 360.0)
+    return np.asarray(np.nan_to_num(np.abs(reduced["channel_rotation_rate"].values) / 360.0))
 
 
 def _orders(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:

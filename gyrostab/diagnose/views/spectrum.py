@@ -42,7 +42,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         flat = np.concatenate([flat, whole], axis=-2) / count
         around = _surroundings(flat)
         ratio = flat / around
-    excess = _near(flat - around) * _expected(baseline, frequency)[:, None, :]
+    # a sum over lines, which only a recording needs
+    excess = _near(flat - around) * _expected(baseline, frequency)[:, None, :] if flat.ndim == 3 else np.zeros(1)
     z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND)))
     half = 0.371 / frequency  # where the Allan variance of a sine is largest
     return view_dataset(
