@@ -53,18 +53,35 @@ def direct_angle_surface(
     return avar, count
 
 
-def cluster_variance(x: NDArray[np.float64], k: int, stride: int) -> tuple[float, int]:
-    """Weighted mean of half squared differences of adjacent cluster means, each at least half full."""
-    total, weight, count = 0.0, 0.0, 0
-    for m in range(0, x.size - 2 * k + 1, stride):
-        first, second = x[m : m + k], x[m + k : m + 2 * k]
-        n1, n2 = np.isfinite(first).sum(), np.isfinite(second).sum()
-        if 2 * n1 < k or 2 * n2 < k:
-            continue
-        total += n1 * n2 * (np.nanmean(second) - np.nanmean(first)) ** 2 / 2
-        weight += n1 * n2
-        count += 1
-    return total / weight if weight else np.nan, count
+def cluster_cell(x: NDArray[np.float64], k: int, *, stride: int = 1, first: int = 0) -> dict[str, float]:
+    """One cell by weighted cluster means with a matrix: a row per pair of clusters at least half full, a column per sample.
+
+    Pairs begin where ``first + m`` is a multiple of `stride`. Degrees of freedom are those under white noise.
+    """
+    here = np.isfinite(x)
+    rows, offered = [], 0
+    for m in range(-first % stride, x.size - 2 * k + 1, stride):
+        offered += 1
+        clusters = np.zeros((2, x.size))
+        clusters[0, m : m + k], clusters[1, m + k : m + 2 * k] = here[m : m + k], here[m + k : m + 2 * k]
+        number = clusters.sum(axis=1)
+        if (2 * number >= k).all():
+            rows.append((number.prod(), clusters[1] / number[1] - clusters[0] / number[0]))
+    if not rows:
+        return {"count": 0}
+    weight = np.array([row[0] for row in rows])
+    design = np.array([row[1] for row in rows]) * np.sqrt(weight)[:, None]
+    values = np.where(here, x - x[here].mean(), 0.0)
+    angles = -np.diff(design, axis=1, prepend=0.0, append=0.0)  # the same terms of an angle instead of its differences
+    pairs = design @ design.T
+    return {
+        "count": len(rows),
+        "avar": float(((design @ values) ** 2).sum() / (2 * weight.sum())),
+        "white_response": float((design**2).sum() / (2 * weight.sum()) * k),
+        "quantization_response": float((angles**2).sum() / (2 * weight.sum()) * k**2 / 3),
+        "coverage": float(weight.sum() / (offered * float(k) ** 2)),
+        "edf": float(np.trace(pairs) ** 2 / (pairs**2).sum()),
+    }
 
 
 def fit_window_plainly(
@@ -96,7 +113,7 @@ def fit_window_plainly(
         scale = np.linalg.norm(columns, axis=0)
         return nnls(columns / scale, whitener @ y, maxiter=1000)[0] / scale
 
-    squares = solve(np.diag(np.sqrt(weight) / y))
+    squares = solve(np.diag(np.sqrt(weight) / (np.maximum.accumulate(y / design[:, 0]) * design[:, 0])))
     for _ in range(6):
         previous = squares
         spread = covariance(squares)

@@ -17,7 +17,7 @@ from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places
 from gyrostab.kernels.vectors import LANES, split_sums
 from gyrostab.log import make_log
 from gyrostab.schema import ESTIMATORS
-from tests.reference import cluster_variance, direct_angle_surface, direct_surface
+from tests.reference import direct_angle_surface, direct_surface
 
 STRICT, WEIGHTED = ESTIMATORS.index("strict_runs"), ESTIMATORS.index("weighted_clusters")
 
@@ -263,11 +263,6 @@ class TestGaps:
         x[rng.random(20_000) < 0.2] = np.nan
         result = davar(log_of(x), window=20_000, step=20_000, taus=[0.01, 0.05, 1.0]).isel(axis=0, time=0)
         assert list(result.estimator.values) == [STRICT, WEIGHTED, WEIGHTED]
-        for tau, stride in ((0.05, 1), (1.0, 6)):
-            cell = result.sel(tau=tau)
-            want, count = cluster_variance(x, round(tau * 100), stride)
-            assert float(cell.avar) == pytest.approx(want, rel=1e-10)
-            assert int(cell["count"]) == count
         # white noise is seen too high, by exactly what the mask says
         assert float(result.white_response.sel(tau=1.0)) == pytest.approx(1.25, abs=0.02)
 

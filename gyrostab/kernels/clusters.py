@@ -3,147 +3,264 @@
 Each cluster mean uses the samples that are there; a pair of clusters with n1 and n2 samples has weight n1 n2, and both
 must be at least half full. Random walk, flicker and ramp come out right. White and quantization noise come out too high
 by factors that the mask alone determines; those responses are returned, so that a fit can use them as its columns.
+
+What a pair of clusters adds does not depend on the window, so it is summed in blocks as the other terms are (see
+`gyrostab.kernels.blocks`). Samples and runs are counted in a mask of one bit a sample, which stays in the cache.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numba.extending import intrinsic
+from numpy.typing import NDArray
 
+from gyrostab.kernels.blocks import windows_from_blocks
 from gyrostab.kernels.compiled import INNER
 
-__all__ = ["cluster_cell", "cluster_prefix"]
+__all__ = ["cluster_cells", "cluster_factor", "cluster_strides", "pack_mask"]
+
+# Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
+_FAST = {"reassoc", "contract", "nsz", "arcp"}
+# First terms of the pairs that are summed for the degrees of freedom, at most; where there are more, sections of so many.
+_TERMS = 384
+_SECTION = 8
+# Places of the sections: spread evenly, but in step with no regular loss.
+_GOLDEN = 0.6180339887498949
+
+
+def cluster_strides(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Distance of the pairs of clusters that are used, a power of two: every `2**shift`-th, or as many as have something to add.
+
+    Pairs closer than k/16 add next to nothing where many of them fit the window; where 256 or fewer do, all are used.
+    """
+    largest = np.maximum(np.minimum(ks // 16, (window - 2 * ks + 1) // 256), 1)
+    return np.maximum(2 ** np.floor(np.log2(largest)).astype(np.int64), 2**shifts).astype(np.int64)
+
+
+@intrinsic
+def _ones(typing_context, word):  # type: ignore[no-untyped-def]
+    """Number of bits of a word that are set."""
+    return word(word), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
 @njit(**INNER)
-def cluster_prefix(starts, stops, n):  # type: ignore[no-untyped-def]
-    """From runs of present samples: the mask (n,), and the number of present samples and of run starts before each, (n + 1,)."""
-    present = np.zeros(n, np.bool_)
-    samples = np.zeros(n + 1, np.int32)
-    runs = np.zeros(n + 1, np.int32)
-    count = 0
+def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
+    """Which of n samples are present, from the runs of them, 64 to a row.
+
+    Returns
+    -------
+    int64 (n // 64 + 1, 4)
+        Samples present, and those of them that begin a run, as bits; numbers of both before these 64.
+    """
+    mask = np.zeros((n // 64 + 1, 4), np.int64)
+    one = np.int64(1)
     for r in range(starts.size):
-        present[starts[r] : stops[r]] = True
-        inside = samples[starts[r] + 1 : stops[r] + 1]
-        for i in range(inside.size):
-            inside[i] = count + i + 1
-        count += inside.size
-        following = starts[r + 1] if r + 1 < starts.size else n
-        samples[stops[r] + 1 : following + 1] = count
-        runs[starts[r] + 1 : following + 1] = r + 1
-    return present, samples, runs
+        first, last = starts[r] >> 6, (stops[r] - 1) >> 6
+        for row in range(first, last + 1):
+            word = np.int64(-1)
+            if row == first:
+                word &= -(one << (starts[r] & 63))
+            if row == last and stops[r] & 63:
+                word &= (one << (stops[r] & 63)) - one
+            mask[row, 0] |= word
+        mask[first, 1] |= one << (starts[r] & 63)
+    for row in range(1, mask.shape[0]):
+        mask[row, 2] = mask[row - 1, 2] + _ones(mask[row - 1, 0])
+        mask[row, 3] = mask[row - 1, 3] + _ones(mask[row - 1, 1])
+    return mask
 
 
 @njit(**INNER)
-def _runs_within(runs, present, a, b):  # type: ignore[no-untyped-def]
-    """Runs of present samples that touch [a, b)."""
-    continued = a > 0 and present[a - 1] and a < present.size and present[a]
-    return runs[b] - runs[a] + (1 if continued else 0)
+def _before(mask, m):  # type: ignore[no-untyped-def]
+    """Number of samples present before m."""
+    row = np.uint64(m >> 6)
+    return mask[row, 2] + _ones(mask[row, 0] & ((np.int64(1) << (m & 63)) - 1))
 
 
 @njit(**INNER)
-def _common(samples, a1, b1, a2, b2):  # type: ignore[no-untyped-def]
-    """Present samples in the intersection of [a1, b1) and [a2, b2)."""
-    a, b = max(a1, a2), min(b1, b2)
-    return samples[b] - samples[a] if b > a else 0
-
-
-@njit(**INNER)
-def _gap_factor(samples, first, length, k):  # type: ignore[no-untyped-def]
-    """Degrees of freedom under white noise, seen through this mask, as a share of the gap-free window's."""
-    stride = max(1, k // 4)
-    total = (length + stride - 1) // stride
-    variance = 0.0
-    expected = 0.0
-    full = 0.0
-    for i in range(total):
-        m = first + i * stride
-        n1 = samples[m + k] - samples[m]
-        n2 = samples[m + 2 * k] - samples[m + k]
-        full += 1.0
-        for j in range(i + 1, min(total, i + 1 + 2 * k // stride)):
-            lag = (j - i) * stride
-            rho = 1.0 - 1.5 * lag / k if lag <= k else 0.5 * lag / k - 1.0
-            if lag < 2 * k:
-                full += 2.0 * rho * rho
+def _add_pairs(theta, mask, a, b, k, stride, row):  # type: ignore[no-untyped-def]
+    """Add to `row` over the pairs of clusters that begin in ``a <= m < b``: weight d^2, weight, what makes the responses, number."""
+    one = np.int64(1)
+    squares = weights = white = quantization = 0.0
+    count = 0
+    for m in range((a + stride - 1) // stride * stride, b, stride):
+        row0, row1, row2 = np.uint64(m >> 6), np.uint64((m + k) >> 6), np.uint64((m + 2 * k) >> 6)
+        low0, low1, low2 = (one << (m & 63)) - one, (one << ((m + k) & 63)) - one, (one << ((m + 2 * k) & 63)) - one
+        middle = mask[row1, 2] + _ones(mask[row1, 0] & low1)
+        n1 = middle - mask[row0, 2] - _ones(mask[row0, 0] & low0)
+        n2 = mask[row2, 2] + _ones(mask[row2, 0] & low2) - middle
         if 2 * n1 < k or 2 * n2 < k:
             continue
-        weight = float(n1 * n2)
-        own = 1.0 / n1 + 1.0 / n2
-        expected += weight * own
-        variance += (weight * own) ** 2
-        for j in range(i + 1, min(total, i + 1 + 2 * k // stride)):
-            p = first + j * stride
-            p1 = samples[p + k] - samples[p]
-            p2 = samples[p + 2 * k] - samples[p + k]
-            if 2 * p1 < k or 2 * p2 < k:
-                continue
-            shared = _common(samples, m, m + k, p, p + k) / (n1 * p1)
-            shared += _common(samples, m + k, m + 2 * k, p + k, p + 2 * k) / (n2 * p2)
-            shared -= _common(samples, m + k, m + 2 * k, p, p + k) / (n2 * p1)
-            variance += 2.0 * weight * p1 * p2 * shared * shared
-    if variance == 0.0:
-        return 0.0
-    return expected * expected / variance * full / (float(total) * total)
+        f1, f2 = float(n1), float(n2)
+        at0, at1, at2 = np.uint64(m), np.uint64(m + k), np.uint64(m + 2 * k)
+        d = (theta[at2] - theta[at1]) * f1 - (theta[at1] - theta[at0]) * f2  # n1 n2 times the difference of the means
+        # a run that a cluster cuts counts in both
+        runs = mask[row1, 3] + _ones(mask[row1, 1] & low1)
+        cut0, cut1 = mask[row0, 0] & ~mask[row0, 1] & (low0 + one) != 0, mask[row1, 0] & ~mask[row1, 1] & (low1 + one) != 0
+        r1 = runs - mask[row0, 3] - _ones(mask[row0, 1] & low0) + cut0
+        r2 = mask[row2, 3] + _ones(mask[row2, 1] & low2) - runs + cut1
+        inverse = 1.0 / (f1 * f2)
+        squares += d * d * inverse
+        weights += f1 * f2
+        white += f1 + f2
+        quantization += 2.0 * (r1 * f2 * f2 + r2 * f1 * f1) * inverse + 2.0 * cut1
+        count += 1
+    row[0] += squares
+    row[1] += weights
+    row[2] += white
+    row[3] += quantization
+    row[4] += count
 
 
 @njit(**INNER)
-def cluster_cell(theta, present, samples, runs, first, window, k):  # type: ignore[no-untyped-def]
-    """One cell of the surface by weighted cluster means.
+def cluster_cells(theta, mask, window, step, k, stride, poor):  # type: ignore[no-untyped-def]
+    """Cells of the `poor` windows of one averaging factor by weighted cluster means.
 
     Parameters
     ----------
     theta : float64 (n + 1,)
         Integral of the rate over present samples, gaps adding nothing.
-    present : bool (n,); samples, runs : int32 (n + 1,)
-        As from `cluster_prefix`.
-    first, window, k : int
-        First sample of the window, its length, averaging factor.
+    mask
+        As from `pack_mask`.
+    window, step, k, stride : int
+        Window, step, averaging factor and distance of the pairs of clusters [samples].
+    poor : bool (n_windows,)
+        Windows that are wanted.
 
     Returns
     -------
-    variance : float
-        Weighted mean of ``(mean2 - mean1)^2 / 2`` [square of the rate's unit].
-    count : int
-        Cluster pairs used.
-    coverage : float
-        Weight used, as a share of the gap-free weight.
-    white, quantization : float
-        Responses to unit white and quantization noise, relative to the gap-free laws.
-    factor : float
-        Degrees of freedom as a share of the gap-free window's.
+    float64 (n_windows, 5)
+        Weighted mean of ``(mean2 - mean1)^2 / 2`` [square of the rate's unit]; responses to unit white and quantization
+        noise, relative to the gap-free laws; weight used, as a share of the gap-free weight; number of pairs used, 0 where
+        there are none or the window is not wanted.
     """
     length = window - 2 * k + 1
-    stride = max(1, k // 16)
-    total_weight = 0.0
-    variance = 0.0
-    white = 0.0
-    quantization = 0.0
-    count = 0
-    for m in range(first, first + length, stride):
-        n1 = samples[m + k] - samples[m]
-        n2 = samples[m + 2 * k] - samples[m + k]
-        if 2 * n1 < k or 2 * n2 < k:
+    whole = length // step
+    head = length - whole * step
+    n_windows = poor.size
+    heads, tails = np.zeros((n_windows + whole, 5)), np.zeros((n_windows + whole, 5))
+    last = -1
+    for j in range(n_windows):
+        if poor[j]:
+            for block in range(max(last + 1, j), j + whole + 1):
+                a = block * step
+                _add_pairs(theta, mask, a, a + head, k, stride, heads[block])
+                if block < n_windows + whole - 1:
+                    _add_pairs(theta, mask, a + head, a + step, k, stride, tails[block])
+            last = j + whole
+    sums = windows_from_blocks(heads, tails, np.full(5, whole), n_windows)
+    out = np.zeros((n_windows, 5))
+    for j in range(n_windows):
+        if poor[j] and sums[j, 4] > 0.0:
+            offered = (j * step + length + stride - 1) // stride - (j * step + stride - 1) // stride
+            out[j, 0] = sums[j, 0] / (2.0 * sums[j, 1])
+            out[j, 1] = sums[j, 2] / (2.0 * sums[j, 1]) * k
+            out[j, 2] = sums[j, 3] / (2.0 * sums[j, 1]) * k * k / 3.0
+            out[j, 3] = sums[j, 1] / (offered * float(k) * k)
+            out[j, 4] = sums[j, 4]
+    return out
+
+
+@njit(**INNER)
+def _look(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
+    """Fill the columns of `places` for m on a grid from `begin` on.
+
+    Rows: present samples before m, m + k and m + 2k, those of the two clusters, and the reciprocal of the product of these
+    two, or zero where a cluster is less than half full.
+    """
+    for i in range(places.shape[1]):
+        m = begin + i * grid
+        for side in range(3):
+            places[side, i] = _before(mask, m + side * k)
+        places[3, i] = places[1, i] - places[0, i]
+        places[4, i] = places[2, i] - places[1, i]
+        used = 2 * places[3, i] >= k and 2 * places[4, i] >= k
+        places[5, i] = 1.0 / (places[3, i] * places[4, i]) if used else 0.0
+
+
+@njit(fastmath=_FAST, **INNER)
+def _overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
+    """Sum over the terms ``first <= j < stop`` of weight times squared covariance with term i, less than k before them.
+
+    Of the means of clusters of n1 and n2 samples, and p1 and p2 of the other term, those share samples that overlap.
+    """
+    a1, a2, n1, n2 = places[1, i], places[2, i], places[3, i], places[4, i]
+    b0, b1, p1, p2 = places[0, first:stop], places[1, first:stop], places[3, first:stop], places[4, first:stop]
+    inverse = places[5, first:stop]
+    total = 0.0
+    for j in range(inverse.size):
+        shared = (a1 - b0[j]) * n2 * p2[j] + (a2 - b1[j]) * n1 * p1[j] - (b1[j] - a1) * n1 * p2[j]
+        total += shared * shared * inverse[j]
+    return total
+
+
+@njit(fastmath=_FAST, **INNER)
+def _touching(places, i, first, stop):  # type: ignore[no-untyped-def]
+    """The same for terms between k and 2k behind term i, whose first cluster meets only the second of that."""
+    a2, n1 = places[2, i], places[3, i]
+    b0, p2, inverse = places[0, first:stop], places[4, first:stop], places[5, first:stop]
+    total = 0.0
+    for j in range(inverse.size):
+        shared = max(a2 - b0[j], 0.0) * n1 * p2[j]
+        total += shared * shared * inverse[j]
+    return total
+
+
+@njit(**INNER)
+def _add_section(places, lags, close, many, sums):  # type: ignore[no-untyped-def]
+    """Add the pairs of terms whose first is one of the first `many` of `places`: of the mask, and of a full window.
+
+    `sums` gets the weight, the pairs, and both of a full window; `lags` are the running sums of the squared correlations of a full
+    window, and `close` of them belong to clusters that overlap their own shifted selves.
+    """
+    size = places.shape[1]
+    for i in range(many):
+        stop = min(i + lags.size, size)
+        sums[2] += 1.0
+        sums[3] += 1.0 + 2.0 * lags[stop - i - 1]
+        if places[5, i] == 0.0:
             continue
-        d = (theta[m + 2 * k] - theta[m + k]) / n2 - (theta[m + k] - theta[m]) / n1
-        weight = float(n1 * n2)
-        total_weight += weight
-        variance += weight * d * d
-        white += weight * (1.0 / n1 + 1.0 / n2)
-        edges = 2.0 * _runs_within(runs, present, m, m + k) / (float(n1) * n1)
-        edges += 2.0 * _runs_within(runs, present, m + k, m + 2 * k) / (float(n2) * n2)
-        if present[m + k - 1] and present[m + k]:
-            edges += 2.0 / (float(n1) * n2)
-        quantization += weight * edges
-        count += 1
-    if count == 0:
-        return np.nan, 0, 0.0, np.nan, np.nan, 0.0
-    offered = (length + stride - 1) // stride
-    return (
-        variance / (2.0 * total_weight),
-        count,
-        total_weight / (offered * float(k) * k),
-        white / (2.0 * total_weight) * k,
-        quantization / (2.0 * total_weight) * k * k / 3.0,
-        _gap_factor(samples, first, length, k),
-    )
+        own = places[3, i] + places[4, i]
+        near = min(i + close, stop)
+        sums[0] += own
+        sums[1] += own * own + 2.0 * places[5, i] * (_overlapping(places, i, i + 1, near) + _touching(places, i, near, stop))
+
+
+@njit(**INNER)
+def _pair_sums(mask, begin, end, grid, k, sums):  # type: ignore[no-untyped-def]
+    """What `_add_section` sums, over the terms at ``begin, begin + grid, ... < end``: all, or sections of them spread out."""
+    total = (end - begin + grid - 1) // grid
+    lags = np.zeros(2 * k // grid + 1)
+    for i in range(1, lags.size):
+        lag = i * grid / k
+        rho = 1.0 - 1.5 * lag if lag <= 1.0 else 0.5 * lag - 1.0
+        lags[i] = lags[i - 1] + rho * rho
+    close = (k + grid - 1) // grid
+    sections = 1 if total <= _TERMS else _TERMS // _SECTION
+    many = total if sections == 1 else _SECTION
+    places = np.empty((6, min(total, many + lags.size - 1)))
+    sums[:] = 0.0
+    for section in range(sections):
+        one = int((section + section * _GOLDEN % 1.0) / sections * (total - many))
+        part = places[:, : min(total - one, places.shape[1])]
+        _look(mask, begin + one * grid, grid, k, part)
+        _add_section(part, lags, close, many, sums)
+
+
+@njit(**INNER)
+def cluster_factor(mask, first, window, k, stride):  # type: ignore[no-untyped-def]
+    """Degrees of freedom of a cell under white noise, seen through its mask, as a share of the gap-free window's.
+
+    The pairs of terms are taken on a grid of k/8 to k/4, finer where few terms fit the window or all of the grid are lost.
+    Arguments as `cluster_cells`, `first` being the first sample of the window.
+    """
+    end = first + window - 2 * k + 1
+    grid = stride
+    while 8 * grid <= k and 48 * grid <= end - first:
+        grid *= 2
+    sums = np.zeros(4)
+    while grid >= stride and sums[1] == 0.0:
+        _pair_sums(mask, (first + stride - 1) // stride * stride, end, grid, k, sums)
+        grid //= 2
+    return sums[0] * sums[0] / sums[1] * sums[3] / (sums[2] * sums[2]) if sums[1] > 0.0 else 0.0

@@ -32,14 +32,20 @@ FIT_FIELDS = ("square", "square_stderr", "free", "variance_null", "variance_line
 
 @njit(**INNER)
 def _quick(system, weight, factor, normal, right, allowed, squares):  # type: ignore[no-untyped-def]
-    """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise."""
+    """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise.
+
+    No noise falls faster than quantization noise does. A cell that lies below the fall from a shorter averaging time
+    is low by chance, and must not count for as much as its own square would have it.
+    """
     normal[:] = 0.0
     right[:] = 0.0
+    level = 0.0
     for i in range(weight.size):
         y = system[i, DATA]
         if y == 0.0:
             continue
-        w = weight[i] * factor[i] / (y * y)
+        level = max(level, y / system[i, 0])
+        w = weight[i] * factor[i] / (level * system[i, 0]) ** 2
         for a in range(5):
             right[a] += w * system[i, a] * y
             for b in range(5):

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.blocks import full_counts, grouped_blocks, groups, windows_from_blocks
-from gyrostab.kernels.clusters import cluster_cell, cluster_prefix
+from gyrostab.kernels.clusters import cluster_cells, cluster_factor, cluster_strides, pack_mask
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.integrate import (
     block_sums,
@@ -99,20 +99,23 @@ def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, ce
 
 
 @njit(**KERNEL)
-def _bridge_gaps(theta, starts, stops, window, step, ks, poor, cells):  # type: ignore[no-untyped-def]
+def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells):  # type: ignore[no-untyped-def]
     """Weighted clusters where too few terms are left (rate logs only)."""
-    present, samples, runs = cluster_prefix(starts, stops, theta.size - 1)
+    mask = pack_mask(starts, stops, theta.size - 1)
     for i in range(ks.size):
+        if not poor[:, i].any():
+            continue
+        bridged = cluster_cells(theta, mask, window, step, ks[i], strides[i], poor[:, i])
         for j in range(poor.shape[0]):
             if poor[j, i]:
-                cell = cluster_cell(theta, present, samples, runs, j * step, window, ks[i])
-                cells[0, j, i] = cell[0]
-                cells[1, j, i] = cell[1]
-                cells[2, j, i] = cell[2]
-                cells[3, j, i] = cell[5]
+                found = bridged[j, 4] > 0.0
+                cells[0, j, i] = bridged[j, 0] if found else np.nan
+                cells[1, j, i] = bridged[j, 4]
+                cells[2, j, i] = bridged[j, 3]
+                cells[3, j, i] = cluster_factor(mask, j * step, window, ks[i], strides[i]) if found else 0.0
                 cells[4, j, i] = WEIGHTED
-                cells[5, j, i] = cell[3]
-                cells[6, j, i] = cell[4]
+                cells[5, j, i] = bridged[j, 1]
+                cells[6, j, i] = bridged[j, 2]
 
 
 class _Angle(NamedTuple):
@@ -211,7 +214,8 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
         _share_gaps(starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, counts, full, cells)
         poor = counts < unit.min_strict * full
         if not unit.zero_fill and not unit.angle and poor.any():
-            _bridge_gaps(angle.flat[: angle.points], starts, stops, unit.window, unit.step, unit.ks, poor, cells)
+            strides = cluster_strides(unit.window, unit.ks, unit.shifts)
+            _bridge_gaps(angle.flat[: angle.points], starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
     if not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
         cells[0][blank] = cells[5][blank] = cells[6][blank] = np.nan
