@@ -1,0 +1,237 @@
+"""The stationary noise that a record is compared with: calibrated on its quiet time.
+
+Band powers of the quiet blocks give Q, N and what they can of B and K; the block means give the slow part of B and K. The posterior
+is kept as draws, so that null records carry the error of the calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.posterior import Posterior, fit_squares, floor_square, noise_posterior, scales, summed
+from gyrostab.diagnose.products import mean_products
+from gyrostab.diagnose.quiet import loudness, quiet_blocks, quiet_spans
+from gyrostab.errors import SchemaError
+from gyrostab.kernels.expected import expected_powers
+from gyrostab.kernels.periodogram import band_edges, ordinates, taper
+from gyrostab.noise import HOUR, LAWS, TERMS, URAD_PER_S
+
+__all__ = ["NOISE", "assemble", "calibrate", "grid_values", "noise_powers", "white_variance"]
+
+Array = NDArray[np.float64]
+#: Random terms, in the order of the dimension `noise`.
+NOISE = ("Q", "N", "B", "K")
+_DRAWS = 512
+#: Values of K and B that the noise may have instead, as multiples of the calibrated ones.
+_FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
+_LOW_SHAPE = 20.0  # of the lowest bands, which say how noisy the mean of a block is
+_EXCESS = 4.0  # standard deviations from which on a block is noisier
+_POWER = "degree2 hour-2 Hz-1"
+
+
+def noise_powers(reduced: xr.Dataset) -> Array:
+    """Expected band powers for unit squares of Q, N, B, K, as the gaps of each block let them be seen.
+
+    Returns
+    -------
+    ndarray, shape (axis, block, band, term)
+        [degree2 hour-2 Hz-1 per squared unit of the noise table].
+    """
+    size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
+    each = expected_powers(taper(size), rate, ordinates(size)) * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR])[:, None]
+    edges = band_edges(size) - 1
+    whole = np.stack([each[:, low:high].mean(axis=1) for low, high in pairwise(edges)])
+    near = reduced["neighbours"].transpose("axis", "block").values
+    near = np.where(np.isfinite(near), near, 1.0)[..., None, None]
+    return np.asarray(near * whole + (1.0 - near) * each.mean(axis=1))
+
+
+def white_variance(reduced: xr.Dataset, square: Array) -> Array:
+    """Variance of block means by Q and N, shape (axis, block) [degree2 hour-2], for squares of shape (axis, 4)."""
+    samples = reduced["samples"].transpose("axis", "block").values.astype(np.float64)
+    near = reduced["neighbours"].transpose("axis", "block").values
+    rate, count = float(reduced.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
+    apart = 1.0 - np.where(np.isfinite(near), near, samples / float(reduced.attrs["block_samples"]))
+    runs = np.maximum(apart, 0.0) * count + 1.0  # each leaves a rounding of the angle at either end
+    return np.asarray(HOUR * rate * square[:, 1:2] / count + 2.0 * URAD_PER_S**2 * rate**2 * square[:, :1] * runs / count**2)
+
+
+def _noisier(power: Array, shape: Array, spectrum: Array) -> Array:
+    """Factor by which the white variance of each block mean exceeds the expected one, from the lowest bands; inputs (block, band)."""
+    count = np.nan_to_num(shape).sum(axis=0) / max(1, int(np.isfinite(shape).all(axis=1).sum()))
+    low = max(2, int(np.searchsorted(np.cumsum(count), _LOW_SHAPE)) + 1)
+    level, deviation = loudness(power[:, :low] / spectrum[:, :low] - 1.0, shape[:, :low])
+    return np.asarray(np.where(deviation > _EXCESS, level, 1.0))
+
+
+def grid_values(term: str, centre: float, scale: float) -> Array:
+    """Values of K or B that the noise may have, from none to far above both the calibrated one and what is just seen."""
+    return np.array([factor * (max(centre, scale) if factor > 1.0 else centre) for factor in _FACTORS[term]])
+
+
+def _grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Array, Array]:
+    """K and B of the coarse grid, and log of the posterior around every point."""
+    centres = np.sqrt(np.median(posterior.slow, axis=0))
+    least = scales(density, span)
+    K, B = grid_values("K", float(centres[1]), least[0]), grid_values("B", float(centres[0]), least[1])
+    place = []
+    for fine, coarse in ((posterior.K, K), (posterior.B, B)):
+        between = np.sqrt(coarse[1:-1] * coarse[2:])
+        place.append(np.searchsorted(np.concatenate([[coarse[1] / np.sqrt(3.0)], between]), fine))
+    mass = np.full((K.size, B.size), 1e-12)
+    np.add.at(mass, tuple(place), posterior.weight)
+    many = [part.ravel() for part in np.meshgrid(K, B, indexing="ij")]
+    return many[0], many[1], np.log(mass.ravel() / mass.sum())
+
+
+def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
+    """Calibrate the noise of every axis on quiet blocks.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        From `reduce_log`.
+    quiet : array_like of bool (block,), or (start, end) or several of these, optional
+        What is known to be quiet: seconds since the start, or ISO times. Without it blocks with little vibration, steady temperature, no
+        rotation, not soon after a restart, and not louder than most.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``coefficient`` and ``stderr`` (axis, term) [units of the noise table]; a ramp is an effect, so R is 0, with the error that a ramp
+        would have. ``quiet(axis, block)``; ``spectrum(axis, block, band)``, the expected power [degree2 hour-2 Hz-1]; ``known_mean`` and
+        ``mean_variance`` (axis, block); ``grid_K``, ``grid_B``, ``grid_prior``, ``grid_calibrated`` (axis, grid), noise that is possible
+        and its log weights; ``columns(axis, block, band, noise)``, ``square``, ``square_stderr`` (axis, noise): the spectrum in its
+        terms; ``posterior(axis, draw, noise)`` and ``posterior_slow(axis, draw, slow)``: draws of the squares in powers and means.
+
+    Raises
+    ------
+    OptionError
+        When `quiet` holds too few blocks.
+    SchemaError
+        When an axis has no spectra to calibrate on.
+
+    Examples
+    --------
+    >>> from gyrostab.diagnose.reduced import reduce_log
+    >>> from gyrostab.simulate import simulate
+    >>> log = simulate({"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=3)
+    >>> baseline = calibrate(reduce_log(log))
+    >>> error = (baseline.coefficient - 0.003).sel(axis="x", term="N") / baseline.stderr.sel(axis="x", term="N")
+    >>> bool(abs(error) < 4.0), baseline.attrs["source"]
+    (True, 'calibrated')
+    """
+    chosen, reason = quiet_blocks(reduced, quiet)
+    columns = noise_powers(reduced)
+    power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
+    mean = reduced["mean"].transpose("axis", "block").values
+    step = float(reduced.attrs["block_s"])
+    found = []
+    for row, axis in enumerate(reduced["axis"].values):
+        fit = summed(power[row][chosen[row]], shape[row][chosen[row]], columns[row][chosen[row]])
+        if fit.power.size < 4:
+            raise SchemaError(
+                f"axis {axis}: the quiet blocks hold spectra in {fit.power.size} bands, too few to calibrate on; "
+                "name other quiet time, or diagnose a part of the record with fewer gaps"
+            )
+        first = white_variance(reduced, np.tile(np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0]), (len(mean), 1)))[row]
+        present = chosen[row] & np.isfinite(mean[row])
+        found.append(noise_posterior(fit, mean[row], first, present, step=step, draws=_DRAWS, rng=np.random.default_rng(row)))
+    attrs = {"source": "calibrated", "calibrated_on": quiet_spans(reduced, chosen), "quiet_by": reason}
+    return assemble(reduced, found, columns, quiet=chosen, attrs=attrs)
+
+
+def assemble(
+    reduced: xr.Dataset,
+    found: list[Posterior],
+    columns: Array,
+    *,
+    quiet: NDArray[np.bool_],
+    attrs: Mapping[str, Any],
+    known_mean: Array | None = None,
+    spectrum: Array | None = None,
+) -> xr.Dataset:
+    """Put the noise of all axes into the Dataset that `calibrate` describes.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+    found : list of Posterior
+        One for each axis.
+    columns : ndarray, shape (axis, block, band, term)
+        From `noise_powers`.
+    quiet : ndarray of bool, shape (axis, block)
+    attrs : mapping
+        ``source``, ``calibrated_on`` and what else there is to say.
+    known_mean : ndarray, shape (axis, block), optional
+        Effects that are taken as known [degree hour-1].
+    spectrum : ndarray, shape (axis, block, band), optional
+        Expected power with effects; that of the noise without it.
+    """
+    square = np.stack([one.square for one in found])
+    expected = np.einsum("abfn,an->abf", columns, square) if spectrum is None else spectrum
+    power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
+    floor = np.array([1e-3 * one.min() / HOUR for one in expected])
+    white = white_variance(reduced, np.stack([square[:, 0], np.maximum(square[:, 1], floor), square[:, 2], square[:, 3]], axis=1))
+    variance = white * np.stack([_noisier(*parts) for parts in zip(power, shape, expected, strict=True)])
+    span = reduced.sizes["block"] * float(reduced.attrs["block_s"])
+    grids = [_grid(one, max(one.square[1], least) * HOUR, span) for one, least in zip(found, floor, strict=True)]
+    draws = np.stack([one.draws for one in found])
+    value, error = _coefficients(found)
+    value[:, 4], error[:, 4] = 0.0, _ramp_error(reduced, white, value, quiet)
+    plane, cube = ("axis", "block"), ("axis", "block", "band")
+    told = ", ".join(f"{term} in {LAWS[term].label}" for term in TERMS)
+    variables: dict[str, Any] = {
+        "coefficient": (("axis", "term"), value, {"long_name": "noise coefficient", "units": told}),
+        "stderr": (("axis", "term"), error, {"long_name": "standard error of the coefficient", "units": told}),
+        "quiet": (plane, quiet, {"long_name": "block is calibrated on", "units": "1"}),
+        "spectrum": (cube, expected, {"long_name": "expected power", "units": _POWER}),
+        "known_mean": (plane, np.zeros(quiet.shape) if known_mean is None else known_mean, {"units": "degree hour-1"}),
+        "mean_variance": (plane, variance, {"long_name": "white variance of the block mean", "units": "degree2 hour-2"}),
+        "columns": ((*cube, "noise"), columns, {"long_name": "expected power per squared coefficient", "units": _POWER}),
+        "square": (("axis", "noise"), square, {"long_name": "squared coefficient that fits the powers", "units": f"square of {told}"}),
+        "square_stderr": (("axis", "noise"), np.stack([one.error for one in found]), {"units": f"square of {told}"}),
+        "posterior": (("axis", "draw", "noise"), draws, {"long_name": "draws of the squares in powers", "units": f"square of {told}"}),
+        "posterior_slow": (("axis", "draw", "slow"), np.stack([one.slow for one in found]), {"units": f"square of {told}"}),
+        "grid_K": (("axis", "grid"), np.stack([grid[0] for grid in grids]), {"units": "deg/h^1.5"}),
+        "grid_B": (("axis", "grid"), np.stack([grid[1] for grid in grids]), {"units": "deg/h"}),
+        "grid_prior": (("axis", "grid"), np.full((len(found), grids[0][0].size), -np.log(grids[0][0].size)), {"units": "1"}),
+        "grid_calibrated": (("axis", "grid"), np.stack([grid[2] for grid in grids]), {"units": "1"}),
+    }
+    coordinates = {
+        name: reduced[name] for name in ("axis", "time", "begin", "end", "frequency", "band_low", "band_high") if name in reduced
+    }
+    joined = [str(axis) for axis, one in zip(reduced["axis"].values, found, strict=True) if not one.joined]
+    return xr.Dataset(
+        variables,
+        coords={**coordinates, "term": list(TERMS), "noise": list(NOISE), "slow": ["B", "K"]},
+        attrs={**attrs, "slow_noise_apart": joined},
+    )
+
+
+def _coefficients(found: list[Posterior]) -> tuple[Array, Array]:
+    """Values and errors (axis, term), R left to the caller; B and K are those of the block means."""
+    value, error = np.zeros((len(found), 5)), np.zeros((len(found), 5))
+    for row, one in enumerate(found):
+        roots = np.sqrt(np.concatenate([one.draws[:, :2], one.slow], axis=1))
+        value[row, :4], error[row, :4] = roots.mean(axis=0), roots.std(axis=0)
+    return value, error
+
+
+def _ramp_error(reduced: xr.Dataset, white: Array, value: Array, quiet: NDArray[np.bool_]) -> Array:
+    """Error that a ramp would have in the quiet means [deg/h^2]."""
+    hours = (reduced["begin"].values + reduced["end"].values)[:, None] / (2.0 * HOUR)
+    present = quiet & np.isfinite(reduced["mean"].transpose("axis", "block").values)
+    error = np.zeros(len(white))
+    for row in range(len(white)):
+        K, B = value[row, 3:4], value[row, 2:3]
+        step = float(reduced.attrs["block_s"])
+        seen = mean_products(hours[:, :0], hours, variance=white[row], step=step, K=K, B=B, present=present[row]).gram[0, 0, 0]
+        error[row] = 1.0 / np.sqrt(seen) if seen > 0.0 else np.inf
+    return error

@@ -1,0 +1,203 @@
+"""Blocks in which nothing happens: what the noise is calibrated on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+
+__all__ = ["LEVEL_SPANS", "loudness", "quiet_blocks", "quiet_spans"]
+
+Array = NDArray[np.float64]
+#: Blocks over which the level is averaged.
+LEVEL_SPANS = (1, 5, 15)
+_LEAST_SHARE, _LEAST = 0.25, 16  # of the blocks; below, the calmest are taken
+_AFTER_RESTART_S = 900.0
+_LOUD = 4.5  # standard deviations
+
+
+def _running(values: Array, count: int) -> Array:
+    """Sum over `count` neighbouring rows, fewer at the ends."""
+    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+    half = count // 2
+    n = values.shape[0]
+    place = np.arange(n)
+    return np.asarray(total[np.minimum(place + half + 1, n)] - total[np.maximum(place - half, 0)])
+
+
+def _restlessness(reduced: xr.Dataset) -> dict[str, Array]:
+    """Channel -> how far each block is from rest, 1 at the limit."""
+    found: dict[str, Array] = {}
+    step = float(reduced["end"][0] - reduced["begin"][0])
+    for name in (str(name) for name in reduced.data_vars):
+        if not name.startswith("channel_"):
+            continue
+        values = reduced[name].values.astype(np.float64)
+        good = np.isfinite(values)
+        if good.sum() < max(_LEAST, values.size // 4):
+            continue
+        place = np.arange(values.size)
+        filled = np.interp(place, place[good], values[good])
+        if name.startswith("channel_vibration") or name == "channel_rotation_rate":
+            size = np.abs(filled)
+            found[name] = size / max(2.0 * float(np.quantile(size, 0.2)), 0.05 * float(size.max()), np.finfo(float).tiny)
+        elif name.startswith("channel_temperature"):
+            smooth = _running(filled[:, None], 5)[:, 0] / _running(np.ones((values.size, 1)), 5)[:, 0]
+            slope = np.abs(np.gradient(smooth, step))
+            scatter = float(np.median(np.abs(np.diff(filled, 2)))) / (5.0 * step)  # of the slope, by noise and by digits
+            found[name] = slope / max(0.3 * float(np.quantile(slope, 0.95)), 3.0 * scatter, np.finfo(float).tiny)
+    if reduced.sizes.get("restart", 0):
+        since = reduced["begin"].values[:, None] - reduced["restart_end"].values
+        since = np.where(since < -step, np.inf, np.maximum(since, 1.0)).min(axis=1)
+        found["restarts"] = min(_AFTER_RESTART_S, _span(reduced) / 10.0) / since
+    return found
+
+
+def _span(reduced: xr.Dataset) -> float:
+    """Length of the record [s]."""
+    return float(reduced["end"][-1] - reduced["begin"][0])
+
+
+def loudness(residual: Array, weight: Array) -> tuple[Array, Array]:
+    """Level of every block against what is expected, over the neighbourhood in which it stands out most.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (block, band)
+        Power over the expected power, less 1; NaN where missing.
+    weight : ndarray, shape (block, band)
+        Shape of the gamma distribution.
+
+    Returns
+    -------
+    level : ndarray, shape (block,)
+        Expected 1.
+    deviation : ndarray, shape (block,)
+        How far it lies above 1 [standard deviations].
+    """
+    use = np.where(np.isfinite(residual) & np.isfinite(weight), weight, 0.0)
+    total = (use * np.nan_to_num(residual)).sum(axis=1, keepdims=True)
+    count = use.sum(axis=1, keepdims=True)
+    level, deviation = np.ones(len(use)), np.full(len(use), -np.inf)
+    for span in LEVEL_SPANS:
+        excess, shape = _running(total, span)[:, 0], _running(count, span)[:, 0]
+        z = excess / np.sqrt(np.maximum(shape, 1e-9))
+        better = z > deviation
+        deviation[better] = z[better]
+        level[better] = 1.0 + (excess / np.maximum(shape, 1e-9))[better]
+    return level, deviation
+
+
+def _typical(power: Array, shape: Array) -> Array | None:
+    """Spectrum (band,) of the block of median level, or None where there is none."""
+    use = np.where(np.isfinite(power), shape, 0.0)
+    if not (use.sum(axis=0) > 0.0).all():
+        return None
+    mean = (use * np.nan_to_num(power)).sum(axis=0) / use.sum(axis=0)
+    filled = use.sum(axis=1) > 0.0
+    level = (use * np.nan_to_num(power / mean)).sum(axis=1)[filled] / use.sum(axis=1)[filled]
+    return np.asarray(mean * np.median(level))
+
+
+def _calm_level(reduced: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Blocks of each axis, (axis, block), whose spectrum is not louder than that of the typical block of `start`."""
+    power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
+    calm = np.broadcast_to(start, power.shape[:2]).copy()
+    for row in range(len(power)):
+        for _ in range(3):
+            typical = _typical(power[row][calm[row]], shape[row][calm[row]])
+            if typical is None:
+                break
+            _, deviation = loudness(power[row] / typical - 1.0, shape[row])
+            kept = start & (deviation < _LOUD)
+            if kept.sum() < max(_LEAST, 0.3 * start.sum()) or (kept == calm[row]).all():
+                break
+            calm[row] = kept
+    return calm
+
+
+def quiet_blocks(reduced: xr.Dataset, quiet: Any = None) -> tuple[NDArray[np.bool_], str]:
+    """Find the blocks to calibrate on.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        From `reduce_log`.
+    quiet : array_like of bool (block,), or sequence of (start, end), optional
+        What the user knows to be quiet; spans are in seconds since the start, or ISO times.
+
+    Returns
+    -------
+    quiet : ndarray of bool, shape (axis, block)
+    reason : str
+        What it was judged by, for people.
+
+    Raises
+    ------
+    OptionError
+        When the quiet time of the user holds no block.
+    """
+    n, axes = reduced.sizes["block"], reduced.sizes["axis"]
+    if quiet is not None:
+        given = _given(reduced, quiet)
+        return np.broadcast_to(given, (axes, n)).copy(), "the time that was named as quiet"
+    restless = _restlessness(reduced)
+    worst = np.max([*restless.values(), np.zeros(n)], axis=0)
+    start = worst <= 1.0
+    names = [name.removeprefix("channel_") for name in restless]
+    reason = f"calm {', '.join(names)}" if names else "the level of each block (no channel tells)"
+    least = max(_LEAST, int(_LEAST_SHARE * n))
+    if start.sum() < least:
+        start = worst <= np.sort(worst)[min(least, n) - 1]
+        reason = f"nothing is calm by {', '.join(names)}: the calmest blocks"
+    return _calm_level(reduced, start), reason
+
+
+def _given(reduced: xr.Dataset, quiet: Any) -> NDArray[np.bool_]:
+    n = reduced.sizes["block"]
+    array = np.asarray(quiet)
+    if array.dtype == np.bool_:
+        if array.shape != (n,):
+            raise OptionError(f"quiet has the shape {array.shape}; give one bool for each of the {n} blocks, or (start, end) pairs")
+        chosen = array.copy()
+    else:
+        begin, end = reduced["begin"].values, reduced["end"].values
+        chosen = np.zeros(n, np.bool_)
+        pairs = [quiet] if array.ndim == 1 else list(quiet)
+        for pair in pairs:
+            low, high = (_seconds(reduced, edge) for edge in pair)
+            chosen |= (begin >= low - 1e-6) & (end <= high + 1e-6)
+    if chosen.sum() < _LEAST:
+        step = float(reduced["end"][0] - reduced["begin"][0])
+        raise OptionError(
+            f"quiet holds {int(chosen.sum())} blocks of {step:g} s; calibration needs {_LEAST} at least: name {_LEAST * step:g} s or more"
+        )
+    return np.asarray(chosen)
+
+
+def _seconds(reduced: xr.Dataset, edge: Any) -> float:
+    if isinstance(edge, int | float | np.integer | np.floating):
+        return float(edge)
+    start = np.datetime64(str(reduced.attrs["start"]).removesuffix("Z"), "ns")
+    try:
+        instant = np.datetime64(str(edge).removesuffix("Z"), "ns")
+    except ValueError as error:
+        raise OptionError(f"quiet: {edge!r} is neither seconds since the start nor an ISO time") from error
+    return float((instant - start) / np.timedelta64(1, "ns")) / 1e9
+
+
+def quiet_spans(reduced: xr.Dataset, quiet: NDArray[np.bool_]) -> list[list[str]]:
+    """Spans of time in which any axis is quiet, [start, end] as ISO times."""
+    start = np.datetime64(str(reduced.attrs["start"]).removesuffix("Z"), "ms")
+    some = np.concatenate([[False], quiet.any(axis=0), [False]])
+    edges = np.flatnonzero(some[1:] != some[:-1]).reshape(-1, 2)
+    begin, end = reduced["begin"].values, reduced["end"].values
+
+    def iso(seconds: float) -> str:
+        return str(start + np.timedelta64(round(seconds * 1e3), "ms")) + "Z"
+
+    return [[iso(begin[first]), iso(end[last - 1])] for first, last in edges]

@@ -1,0 +1,96 @@
+"""Expected periodograms of the noise terms in a block: what taper, mean and sampling make of their spectra."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["expected_powers", "sample_covariance"]
+
+Array = NDArray[np.float64]
+_EXACT = 48  # ordinates that are computed one by one; above, the ratio to the plain spectrum is interpolated
+_SPARSE = 48
+
+
+def _second_difference(integral: Array) -> Array:
+    """``F(l + 1) - 2 F(l) + F(l - 1)`` for an even F given at 0, 1, 2, ..."""
+    return np.concatenate([[2.0 * (integral[1] - integral[0])], integral[2:] - 2.0 * integral[1:-1] + integral[:-2]])
+
+
+def sample_covariance(size: int, rate: float) -> Array:
+    """Covariance of samples l apart of unit Q, N, B and K, where the samples are means over their intervals.
+
+    That of B and K is one of differences: it has an unknown constant, which no block statistic sees.
+
+    Parameters
+    ----------
+    size : int
+        Lags.
+    rate : float
+        Sampling rate [Hz].
+
+    Returns
+    -------
+    ndarray, shape (4, size)
+        For angles of unit variance [1 s-2], a density of 1 [Hz], ``B = 1`` and ``variance of the walk 1 / s`` [s].
+    """
+    lag = np.arange(size + 1, dtype=np.float64)
+    out = np.zeros((4, size))
+    out[0, :2] = 2.0 * rate**2, -(rate**2)
+    out[1, 0] = rate
+    inner = np.log(np.maximum(lag, 1.0)) * lag**2
+    far = np.maximum(lag[:-1], 1.0)
+    out[2] = _second_difference(0.75 * lag**2 - 0.5 * inner) / math.pi
+    series = -(np.log(far) - 1.0 / (12.0 * far**2)) / math.pi  # of the second difference, which loses its digits far out
+    out[2] = np.where(lag[:-1] > 1000.0, series, out[2])
+    out[3] = np.where(lag[:-1] > 0.0, -lag[:-1] / 2.0, -1.0 / 6.0) / rate
+    return out
+
+
+def _spectra(frequency: Array, rate: float) -> Array:
+    """Plain two-sided densities of the four terms, shape (4, frequency)."""
+    bend = np.sin(math.pi * frequency / rate)
+    return np.stack([4.0 * rate * bend**2, np.ones_like(frequency), 0.5 / (math.pi * frequency), 1.0 / (2.0 * rate * bend) ** 2])
+
+
+def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
+    """Expected periodogram of every ordinate of a full block for unit strength of each term, as a two-sided density.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (size,)
+        The taper, which comes after the mean of the block is taken off.
+    rate : float
+        Sampling rate [Hz].
+    ordinates : int
+        Ordinates 1, 2, ... that are wanted.
+
+    Returns
+    -------
+    ndarray, shape (4, ordinates)
+        Q, N, B, K in the units of `sample_covariance`; the power of white noise is exactly its density.
+
+    Examples
+    --------
+    >>> powers = expected_powers(np.ones(256), 1.0, 100)
+    >>> plain = 1.0 / (2.0 * np.pi * np.arange(1, 101) / 256.0) ** 2
+    >>> (powers[3] / plain)[:3].round(1)  # without a taper a random walk is seen threefold, less the mean
+    array([2., 2., 2.])
+    """
+    size = weights.size
+    places = np.unique(np.concatenate([np.arange(1, min(_EXACT, ordinates) + 1), np.geomspace(1, ordinates, _SPARSE).round().astype(int)]))
+    covariance = sample_covariance(size + 1, rate)
+    wrapped = np.concatenate([covariance[:, :size], np.zeros((4, 1)), covariance[:, size - 1 : 0 : -1]], axis=1)
+    density = np.fft.fft(wrapped, axis=1).real
+    taper, box = np.fft.fft(weights, 2 * size), np.fft.fft(np.ones(size), 2 * size)
+    found = np.empty((4, places.size))
+    for number, k in enumerate(places):
+        seen = np.roll(taper, 2 * k) - taper[2 * k] * box / size
+        found[:, number] = density @ (seen.real**2 + seen.imag**2) / (2 * size)
+    found /= found[1]
+    ratio = found / _spectra(places * rate / size, rate)
+    wanted = np.arange(1, ordinates + 1)
+    between = np.stack([np.interp(np.log(wanted), np.log(places), row) for row in ratio])
+    return np.asarray(between * _spectra(wanted * rate / size, rate))
