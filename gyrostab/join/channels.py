@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
 from gyrostab.join.grid import Piece
-from gyrostab.join.lazy import Part, lay
+from gyrostab.join.lazy import Part, fill_parts, lay
 from gyrostab.schema import log_channels
+from gyrostab.store.direct import can_fill, with_fill
 from gyrostab.timegrid import grid_index, grid_times
 
 __all__ = ["join_channels"]
@@ -129,4 +131,15 @@ def _taken(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
     edges = np.concatenate([[0], np.flatnonzero(np.diff(places) != 1) + 1, [len(places)]])
     if len(edges) > _CUTS * (len(arrays) + 1):
         return np.asarray(whole)[places]
-    return da.concatenate([whole[places[a] : places[b - 1] + 1] for a, b in pairwise(edges)])
+    taken = da.concatenate([whole[places[a] : places[b - 1] + 1] for a, b in pairwise(edges)])
+    return with_fill(taken, partial(fill_parts, [_parts(arrays, places)])) if all(map(can_fill, arrays)) else taken
+
+
+def _parts(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[Part]:
+    """The values at `places` as stretches of the arrays."""
+    begins = np.cumsum([0, *map(len, arrays)])
+    owner = np.searchsorted(begins, places, side="right") - 1
+    edges = np.flatnonzero((np.diff(places, prepend=-2, append=-2) != 1) | (np.diff(owner, prepend=-1, append=-1) != 0))
+    return [
+        (arrays[owner[a]], None, np.array([[a, places[a] - begins[owner[a]], b - a]], dtype=np.int64)) for a, b in pairwise(edges.tolist())
+    ]

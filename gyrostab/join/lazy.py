@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gyrostab.store.direct import can_fill, fill_row, with_fill
 
-__all__ = ["Part", "chunk_of", "lay"]
+__all__ = ["Part", "chunk_of", "fill_parts", "lay"]
 
 #: An array (time), or (axis, time) with the row to take, and its runs: first sample of the grid, first of the array, length.
 Part = tuple[Any, int | None, NDArray[np.int64]]
@@ -124,10 +124,10 @@ def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = F
     joined = da.Array(graph, name, chunks, dtype=np.float64)
     if not all(can_fill(array) for parts in rows for array, _, _ in parts):
         return joined
-    return with_fill(joined, partial(_fill, rows))
+    return with_fill(joined, partial(fill_parts, rows))
 
 
-def _fill(rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]) -> None:
+def fill_parts(rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]) -> None:
     """Samples of one row from `begin` on, as the tasks of `lay` make them."""
     found = [one for part in rows[row] for one in _reaching(part, begin, begin + out.size)]
     done = 0

@@ -27,6 +27,8 @@ __all__ = ["open_stored"]
 
 #: Values from which a variable of a log is a dask array.
 _SMALL = 2**17
+#: Samples of the largest chunk that is kept when only a part of it was wanted.
+_KEPT_SAMPLES = 2**20
 
 
 def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
@@ -177,7 +179,8 @@ class _Chunks:
             low, high = max(begin, first), min(end, first + self.length)
             place = out[low - begin : high - begin]
             try:
-                self._decode(self._stored(row, number)[low - first : high - first], place)
+                whole = low == first and high == min(first + self.length, self.shape[-1])
+                self._decode(self._stored(row, number, whole=whole)[low - first : high - first], place)
             except ChunkDamage as damage:
                 self._tell(row, number, str(damage))
                 place[:] = np.nan
@@ -190,13 +193,14 @@ class _Chunks:
         if self.missing is not None and self.missing == self.missing:
             out[raw == self.missing] = np.nan
 
-    def _stored(self, row: int, number: int) -> NDArray[Any]:
-        """One chunk as it lies on disk; the last of a row has room for more than there is."""
+    def _stored(self, row: int, number: int, *, whole: bool) -> NDArray[Any]:
+        """One chunk as it lies on disk; the last of a row has room for more than there is. One that is not wanted `whole` is kept."""
         place = (number,) if self.ndim == 1 else (row, number)
-        whole = read_chunk(self.path, self.name, place, zarr=self.zarr, opened=self.opened)
-        if whole.size != self.length:
-            raise ChunkDamage(f"is damaged: it holds {whole.size} values in place of {self.length}")
-        return whole
+        read = read_chunk if whole or self.length > _KEPT_SAMPLES else _kept_chunk
+        chunk = read(self.path, self.name, place, zarr=self.zarr, opened=self.opened)
+        if chunk.size != self.length:
+            raise ChunkDamage(f"is damaged: it holds {chunk.size} values in place of {self.length}")
+        return chunk
 
     def _tell(self, row: int, number: int, damage: str) -> None:
         """Warn of a damaged chunk, once; or stop at it."""
@@ -213,6 +217,9 @@ class _Chunks:
         with _TELLING:
             _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
 
+
+#: Chunks of which only a part was wanted: where one part of a run ends, another begins.
+_kept_chunk = lru_cache(maxsize=16)(read_chunk)
 
 _TELLING = threading.Lock()
 
