@@ -5,12 +5,15 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.physics.base import Chunk, Effect, Setup
+from gyrostab.davar import davar
+from gyrostab.log import make_log
+from gyrostab.physics.base import Chunk, Effect, Setup, Windows
 
 
 def run(
@@ -80,3 +83,29 @@ def random_cuts(seed: int, size: int, pieces: int = 5) -> list[int]:
     rng = np.random.default_rng(seed)
     places: NDArray[np.int64] = np.unique(np.concatenate([rng.integers(1, size, pieces), [1, size // 2, size // 2 + 1]]))
     return [int(place) for place in places if 0 < place < size]
+
+
+def avar(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:
+    """Allan variance of every row over the whole record."""
+    log = make_log(np.atleast_2d(rates), rate=rate, unit="deg/h")
+    return davar(log, window=log.sizes["time"], taus=[float(tau) for tau in taus], tau_max=float(max(taus))).avar.isel(time=0).values
+
+
+def windows_of(size: int, rate: float, length: float, frequency: Any = (1.0,), **more: Any) -> Windows:
+    """Windows of `length` [s] one after the other."""
+    edges = np.arange(0.0, size / rate + 1e-9, length)
+    return Windows(edges[:-1], edges[1:], np.asarray(frequency, float), rate, more.pop("axes", ("x",)), **more)
+
+
+def band_powers(rates: Any, rate: float, edges: Any) -> NDArray[np.float64]:
+    """Mean two-sided density between edges [Hz], of the mean periodogram of the rows."""
+    rows = np.atleast_2d(rates)
+    power = (np.abs(np.fft.rfft(rows, axis=1)) ** 2 / rows.shape[1] / rate).mean(axis=0)
+    f = np.fft.rfftfreq(rows.shape[1], 1 / rate)
+    return np.array([power[(f > low) & (f < high)].mean() for low, high in pairwise(edges)])
+
+
+def said_density(effect: Effect, rate: float, edges: Any, parameter: str, axes: Sequence[str] = ("x",)) -> NDArray[np.float64]:
+    """The same as `band_powers` of the density that the effect says, by fine bands."""
+    fine = [np.linspace(low, high, 60)[1:-1] for low, high in pairwise(edges)]
+    return np.array([effect.explain(windows_of(100, rate, 10.0 / rate, f, axes=axes)).spectrum[parameter][0].mean() for f in fine])

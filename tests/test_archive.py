@@ -1,4 +1,4 @@
-"""Hundreds of files as one log: regular logs joined lazily, and damaged or missing files that leave a gap."""
+"""Hundreds of files as one log: regular logs joined lazily."""
 
 from __future__ import annotations
 
@@ -14,52 +14,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gyrostab import export
-from gyrostab.cli import main
-from gyrostab.errors import FormatError, MissingUnitError, OptionError, TimeError, UnitError
-from gyrostab.gaps import gap_variables
+from gyrostab.errors import OptionError, TimeError, UnitError
 from gyrostab.join import join_logs
 from gyrostab.join.grid import runs_of
 from gyrostab.read import read_log
 from gyrostab.regularise import gap_table, regularise
-from gyrostab.run import load_log
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
-
-RATE = 50.0
-START = int(np.datetime64("2026-03-01T10:00:00", "ns").astype(np.int64))
-SIZE = 6000
-
-
-def signal(size: int = SIZE, *, seed: int = 5, holes: float = 0.05) -> np.ndarray:
-    """Two axes of counts, with stretches missing in both."""
-    rng = np.random.default_rng(seed)
-    values = np.round(rng.normal(0, 180, (2, size)))
-    for start in rng.integers(0, size, int(holes * size / 10)):
-        values[:, start : start + rng.integers(1, 20)] = np.nan
-    return values
-
-
-def nan_runs(values: np.ndarray) -> np.ndarray:
-    """Table of gaps of samples (axis, time) that are missing in every axis, by the plain way."""
-    bad = np.isnan(values).all(axis=0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]))).reshape(-1, 2)
-    length = edges[:, 1] - edges[:, 0]
-    return np.stack([edges[:, 0], edges[:, 1], length, 0 * length, 0 * length], axis=1)
-
-
-def log_of(values: np.ndarray, first: int = 0, *, rate: float = RATE, start: int = START, shift: int = 0, axes: str = "xy") -> xr.Dataset:
-    """A lazy regular log of the samples from `first` on of a grid; its clock is `shift` [ns] late."""
-    begin = int(grid_times(start, rate, first)) + shift
-    log = xr.Dataset(
-        {"rate": (("axis", "time"), values, {"units": "degree hour-1"}), **gap_variables(nan_runs(values), begin, rate)},
-        coords={"axis": list(axes), **time_coordinate(begin, rate, values.shape[1])},
-        attrs={"kind": "rate", "sampling_rate_hz": rate},
-    )
-    return rechunked(log, 700)
-
-
-def rechunked(log: xr.Dataset, length: int) -> xr.Dataset:
-    return log.assign(rate=log.rate.chunk(time=length, axis=1))
+from gyrostab.timegrid import TimeGridIndex, grid_times
+from tests.regular_logs import RATE, SIZE, START, cut, log_of, nan_runs, rechunked, said, signal
 
 
 def names(logs: list[xr.Dataset]) -> list[str]:
@@ -70,14 +32,6 @@ def join(*logs: xr.Dataset, **options) -> xr.Dataset:
     return join_logs(list(logs), names(list(logs)), **options)
 
 
-def cut(values: np.ndarray, *spans: tuple[int, int], **options) -> list[xr.Dataset]:
-    return [log_of(values[:, a:b], a, **options) for a, b in spans]
-
-
-def said(log: xr.Dataset) -> str:
-    return " | ".join(log.attrs["notes"])
-
-
 def table_of(log: xr.Dataset) -> np.ndarray:
     """First sample, end and length of every gap."""
     table = gap_table(log)
@@ -85,9 +39,6 @@ def table_of(log: xr.Dataset) -> np.ndarray:
     assert isinstance(index, TimeGridIndex)
     first, end = (np.rint((table[name].to_numpy().astype(np.int64) - index.start) * RATE / 1e9) for name in ("start", "end"))
     return np.stack([first, end, table["samples"]], axis=1).astype(np.int64)
-
-
-# --- joining -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".zarr"])
@@ -356,144 +307,6 @@ def test_two_hundred_logs_open_without_being_read() -> None:
     logs = cut(values, *((a, a + 302) for a in range(0, 200 * 300, 300)))
     joined = join(*reversed(logs))
     np.testing.assert_array_equal(joined.rate, values)
-
-
-# --- damaged and missing files -----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def archive(tmp_path: Path) -> list[Path]:
-    """Five raw files of ten seconds each, a second apart; their names sort like run_9, run_10."""
-    values = signal(2750, holes=0)
-    paths = []
-    for place in range(5):
-        rows = range(place * 550, place * 550 + 500)
-        paths.append(tmp_path / f"run_{place + 8}.csv")
-        body = "".join(f"{n / RATE:.2f},{values[0, n]:.0f},{values[1, n]:.0f}\n" for n in rows)
-        paths[-1].write_text("time [s],gyro_x [deg/h],gyro_y [deg/h]\n" + body)
-    return paths
-
-
-def empty(path: Path) -> None:
-    path.write_text("")
-
-
-def binary(path: Path) -> None:
-    path.write_bytes(bytes(range(256)) * 40)
-
-
-def cut_gzip(path: Path) -> None:
-    import gzip
-
-    path.write_bytes(gzip.compress(path.read_bytes())[:2000])
-
-
-def garbled(path: Path) -> None:
-    head, *rows = path.read_text().splitlines()
-    path.write_text("\n".join([head, *rows[:5], *("?;!" for _ in rows[5:])]))
-
-
-@pytest.mark.parametrize("damage", [empty, binary, cut_gzip, garbled, Path.unlink])
-def test_a_damaged_raw_file_becomes_a_gap(archive: list[Path], damage) -> None:
-    whole = load_log(archive)
-    damage(archive[2])
-    raw = read_log([*archive[3:], *archive[:3]])
-    log = regularise(raw)
-    np.testing.assert_array_equal(log.rate[:, :1050], whole.rate[:, :1050])
-    np.testing.assert_array_equal(log.rate[:, 1650:], whole.rate[:, 1650:])
-    assert gap_table(log)[["samples", "cause"]].to_numpy().tolist() == [[50, "missing"], [600, "unreadable"], [50, "missing"]]
-    assert log.attrs["unreadable_files"] == ["run_10.csv"]
-    assert log.attrs["source_files"] == ["run_8.csv", "run_9.csv", "run_11.csv", "run_12.csv"]
-    note = next(note for note in log.attrs["notes"] if "run_10.csv" in note)
-    assert "its time is between 1970-01-01T00:00:20.980 and 1970-01-01T00:00:33.000" in note
-    with pytest.raises(FormatError, match=r"run_10\.csv"):
-        read_log(archive, strict=True)
-    with pytest.raises(FormatError, match=r"run_10\.csv"):
-        read_log(archive[2])
-
-
-def test_the_first_and_the_last_file_leave_no_gap(archive: list[Path]) -> None:
-    empty(archive[0])
-    log = load_log(archive)
-    assert gap_table(log)["cause"].tolist() == ["missing"] * 3
-    assert "run_8.csv: the file is empty; copy it again; the file is left out: where no other file has its time" in said(log)
-
-
-def test_more_than_half_is_no_damage(archive: list[Path]) -> None:
-    for path in archive[:3]:
-        empty(path)
-    with pytest.raises(FormatError, match=r"run_8.csv.*3 of 5 files cannot be read.*reading options"):
-        read_log(archive)
-    with pytest.raises(FormatError, match="there is no such file"):
-        read_log([path.with_suffix(".txt") for path in archive])
-    two = read_log([archive[0], archive[4]])
-    assert two.attrs["unreadable_files"] == ["run_8.csv"]
-
-
-def test_a_wrong_option_is_no_damage(archive: list[Path]) -> None:
-    with pytest.raises(OptionError, match="no such column"):
-        read_log(archive, map={"wx": "gyro_x"})
-    with pytest.raises(FormatError, match="no reader takes this directory"):
-        read_log([*archive, archive[0].parent])
-    archive[1].write_text("time [s],gyro_x\n11,1\n11.02,2\n")
-    with pytest.raises(MissingUnitError, match=r"run_9.csv"):
-        read_log(archive)
-
-
-def test_without_stamps_a_damaged_file_is_an_error(tmp_path: Path) -> None:
-    paths = [tmp_path / f"{place}.csv" for place in range(3)]
-    for path in paths:
-        path.write_text("gyro_x [deg/h]\n1\n2\n")
-    empty(paths[1])
-    with pytest.raises(FormatError, match=r"1.csv: the file is empty.*no time stamps"):
-        read_log(paths, rate=1)
-
-
-@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
-def test_a_damaged_regular_log_becomes_a_gap(tmp_path: Path, suffix: str) -> None:
-    values = signal(4000, holes=0)
-    write = export.to_netcdf if suffix == ".nc" else export.to_zarr
-    paths = [
-        write(log, tmp_path / f"{place}{suffix}") for place, log in enumerate(cut(values, *((a, a + 1000) for a in range(0, 4000, 1000))))
-    ]
-    if suffix == ".nc":
-        paths[1].write_bytes(paths[1].read_bytes()[:3000])
-    else:
-        for path in paths[1].glob(".z*"):
-            path.write_text("{")
-    log = read_log([*paths, tmp_path / f"2a{suffix}"])
-    np.testing.assert_array_equal(log.rate[:, :1000], values[:, :1000])
-    np.testing.assert_array_equal(log.rate[:, 2000:], values[:, 2000:])
-    assert gap_table(log)[["samples", "cause"]].to_numpy().tolist() == [[1000, "unreadable"]]
-    assert log.attrs["unreadable_files"] == [f"1{suffix}", f"2a{suffix}"]
-    with pytest.raises(FormatError, match=rf"1\{suffix}"):
-        read_log(paths, strict=True)
-
-
-def test_raw_files_and_regular_logs_do_not_mix(archive: list[Path], tmp_path: Path) -> None:
-    path = export.to_netcdf(log_of(signal(500)), tmp_path / "log.nc")
-    with pytest.raises(OptionError, match=r"log.nc is a regular log already and run_8.csv is not.*gyrostab ingest"):
-        read_log([path, archive[0]])
-
-
-def test_each_file_is_told_as_it_is_read(archive: list[Path]) -> None:
-    told: list[tuple[int, int, str]] = []
-    log = load_log(archive, on_file=lambda number, total, path: told.append((number, total, path.name)))
-    assert told == [(number, 5, f"run_{number + 7}.csv") for number in range(1, 6)]
-    assert "on_file" not in log.attrs["history"]
-
-
-def test_the_command_line_goes_on_unless_strict(archive: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    binary(archive[2])
-    command = ["ingest", *map(str, archive), "--quiet-progress"]
-    assert main([*command, "-o", str(tmp_path / "log.nc")]) == 0
-    assert "run_10.csv" in capsys.readouterr().err
-    with export.open_log(tmp_path / "log.nc") as log:
-        assert log.attrs["unreadable_files"] == ["run_10.csv"]
-        assert "unreadable" in set(gap_table(log)["cause"])
-    assert main([*command, "-o", str(tmp_path / "second.nc"), "--strict"]) == 2
-    assert "run_10.csv" in capsys.readouterr().err
-    assert not (tmp_path / "second.nc").exists()
 
 
 # --- memory ------------------------------------------------------------------------------------------------------
