@@ -152,10 +152,11 @@ class Buffers:
             matrix = np.empty((len(self.rows_of), self.rows))
             found: dict[Any, NDArray[Any] | Stored] = {}
             for key, parts in self._parts.items():
-                found[key] = matrix[self.rows_of.index(key)] if key in self.rows_of else np.empty(self.rows, self.dtypes[key])
+                column = matrix[self.rows_of.index(key)] if key in self.rows_of else np.empty(self.rows, self.dtypes[key])
                 if parts:
-                    np.concatenate(parts, out=found[key])
+                    np.concatenate(parts, out=column)
                 parts.clear()
+                found[key] = column
             return found
         return {key: Stored(self._spool, self.dtypes[key], *pieces) for key, pieces in self._pieces.items()}
 

@@ -6,9 +6,11 @@ No value is ever interpolated, averaged or moved by a fraction of a sample: a sa
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
@@ -19,7 +21,8 @@ from gyrostab.regularise.fill import gathered, on_grid
 from gyrostab.regularise.gaps import find_gaps, gap_table
 from gyrostab.regularise.notes import describe, describe_channels, describe_rate
 from gyrostab.regularise.place import Placement, place_by_count, place_by_stamp, place_without_time
-from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_rate, odd_stretches
+from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_near, estimate_rate, odd_stretches
+from gyrostab.regularise.repeats import find_repeats, with_repeats
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name
 from gyrostab.store import chunk_samples
@@ -29,6 +32,7 @@ from gyrostab.windows import duration_seconds
 __all__ = ["gap_table", "regularise"]
 
 _DISAGREE = 0.02  # a declared rate further off than this is a mistake
+_ROUNDS = 4  # a repetition within another shows only when the latter is gone
 _OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "history", "unreadable_spans")
 
 
@@ -75,6 +79,8 @@ def _place(
         if declared is None or found.rows - found.absent > 1:
             raise
         estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
+    if declared is not None and abs(declared / estimate.raw - 1) > _DISAGREE:
+        estimate = estimate_near(stamps, declared) or estimate
     rate = estimate.rate
     if declared is not None:
         if abs(declared / estimate.raw - 1) > _DISAGREE:
@@ -87,10 +93,24 @@ def _place(
         placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
         odd = []
     else:
-        placement = place_by_stamp(stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where)
+        placement = _place_once(raw, found, partial(place_by_stamp, stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where))
         odd = odd_stretches(stamps, 1e9 / rate)
     notes += describe_rate(raw, estimate, rate, odd, placement)
     return placement, rate
+
+
+def _place_once(raw: xr.Dataset, found: Survey, place: Callable[[], Placement]) -> Placement:
+    """Place the rows, each sample once: stretches of rows that the log holds twice are duplicates and not a restart of the clock."""
+    placement, known = place(), np.empty((0, 3), dtype=np.int64)
+    for _ in range(_ROUNDS):
+        repeats = find_repeats(raw, signal_name(raw), placement)
+        if not len(repeats):
+            break
+        for row, _source, length in repeats.tolist():
+            found.leave_out(row, row + length)
+        known = np.concatenate([known, repeats])
+        placement = place()
+    return with_repeats(placement, raw, known) if len(known) else placement
 
 
 def _channels(raw: xr.Dataset, found: Survey, placement: Placement, rate: float, chunk: int) -> tuple[dict[str, Any], dict[str, Any]]:

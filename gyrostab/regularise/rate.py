@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from gyrostab.errors import TimeError
 from gyrostab.kernels.stamps import NO_STAMP, piece_sums, track
 
-__all__ = ["RateEstimate", "Stamps", "estimate_rate", "odd_stretches", "starting_period"]
+__all__ = ["RateEstimate", "Stamps", "estimate_near", "estimate_rate", "odd_stretches", "starting_period"]
 
 SECOND = 1e9
 #: Gives the blocks of row numbers and stamps, from the first on, as often as asked.
 Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 _GAIN = 0.1
-_SURE = 500.0  # samples over which the first estimate of the period of a long log is trusted to count
+_SURE = 500.0  # samples, of a long log
+_SINGLE = 0.1  # share of the steps that must be one sample of a rate that is given
 _MAX_PIECES = 200_000
 _BLOCK = 1 << 20
 
@@ -313,13 +314,42 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         what = "time runs backwards" if (steps < 0).any() else "all stamps are the same"
         raise TimeError(f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ")
     period, counted, coarse = starting_period(parts)
-    sure = min(_SURE, max(5.0, len(steps) / 20))
-    longest = _longest(parts, period) if counted else sure * period
-    pieces = _pieces(stamps, period, counted, coarse, longest)
+    longest = _longest(parts, period) if counted else _sure(len(steps)) * period
+    return _estimate(_pieces(stamps, period, counted, coarse, longest), period, counted, coarse)
+
+
+def _sure(steps: int) -> float:
+    """Samples over which a first estimate of the period, from so many steps, is trusted to count."""
+    return min(_SURE, max(5.0, steps / 20))
+
+
+def _estimate(pieces: NDArray[np.float64], period: float, counted: bool, coarse: bool) -> RateEstimate:
     period, error, samples = _pooled(pieces, period, counted and not coarse)
     rate = SECOND / period
     stderr = rate * error / period
     return RateEstimate(_plain(rate, stderr + 1e-12 * rate, samples, counted and not coarse), stderr, counted, coarse, rate)
+
+
+def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
+    """The rate near a nominal one [Hz], where the stamps are samples of it of which some are missing, however regularly.
+
+    Of every five rows the same two may be missing: the stamps by themselves then speak for three fifths of the rate. They can be
+    samples of `rate` when their steps are whole numbers of its period and some are one period; otherwise the answer is None.
+
+    Examples
+    --------
+    >>> kept = np.flatnonzero(np.arange(5000) % 5 < 3)
+    >>> stamps = lambda: iter([(np.arange(3000), kept * 10_000_000)])
+    >>> estimate_rate(stamps, where="tool.csv").rate, estimate_near(stamps, 100.0).rate
+    (60.0, 100.0)
+    """
+    stamps = partial(_recut, stamps, _BLOCK)
+    parts = _pools(stamps)
+    period = SECOND / rate
+    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64) if parts else np.empty(0)
+    if len(steps) == 0 or np.mean(np.abs(steps / period - 1) < 0.25) < _SINGLE or _misfit(steps, period) > 0.15:
+        return None
+    return _estimate(_pieces(stamps, period, False, False, _sure(len(steps)) * period), period, False, False)
 
 
 def odd_stretches(stamps: Stamps, period: float, *, size: int = 1024) -> list[tuple[int, int, float]]:
@@ -345,7 +375,8 @@ def odd_stretches(stamps: Stamps, period: float, *, size: int = 1024) -> list[tu
 def _paces(values: NDArray[np.int64], size: int) -> Iterator[tuple[int, float]]:
     """First row of every stretch of `size` stamps (the last may be shorter), and how far apart its stamps are as a rule [ns]."""
     whole = len(values) // size
-    paces = np.median(np.diff(values[: whole * size].reshape(whole, size)[:, ::16], axis=1), axis=1) / 16 if whole else []
+    table = np.diff(values[: whole * size].reshape(whole, size)[:, ::16], axis=1)
+    paces = np.median(table, axis=1) / 16 if whole else np.empty(0)
     yield from ((place * size, float(pace)) for place, pace in enumerate(paces))
     if len(values) - whole * size >= size // 4:
         yield whole * size, float(np.median(np.diff(values[whole * size :: 16]))) / 16

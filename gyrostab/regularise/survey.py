@@ -38,6 +38,8 @@ class Survey:
         Axes whose value never changes.
     filled : dict
         Channel on ``row`` -> rows that have a number.
+    repeated : int
+        Rows that repeat others.
     """
 
     rows: int
@@ -47,6 +49,14 @@ class Survey:
     infinite: NDArray[np.int64]
     constant: list[str]
     filled: dict[str, int] = field(default_factory=dict)
+    repeated: int = 0
+
+    def leave_out(self, begin: int, end: int) -> None:
+        """Take the rows `begin` to `end` for repetitions, which hold no sample of their own."""
+        bits = np.unpackbits(self.present[begin // 8 : -(-end // 8)])
+        self.repeated += int(bits[begin % 8 : begin % 8 + end - begin].sum())
+        bits[begin % 8 : begin % 8 + end - begin] = 0
+        self.present[begin // 8 : -(-end // 8)] = np.packbits(bits)
 
     def mask(self, begin: int, end: int) -> NDArray[np.bool_]:
         """Rows `begin` to `end` that hold a sample."""
@@ -122,7 +132,7 @@ def blocks(
     for begin in range(0, found.rows, block):
         end = min(found.rows, begin + block)
         values = in_memory(stamps[begin:end]).astype("datetime64[ns]", copy=False).view(np.int64)
-        if all_rows or found.absent == 0:
+        if not found.repeated and (all_rows or found.absent == 0):
             yield np.arange(begin, end), values
         else:
             keep = found.mask(begin, end)
