@@ -16,9 +16,11 @@ from gyrostab.timegrid import time_coordinate
 from gyrostab.units import INNER, parse_unit
 from gyrostab.windows import duration_seconds
 
-__all__ = ["HELD", "channel", "check_points", "combine", "inner_unit", "piecewise", "stamp"]
+__all__ = ["HELD", "Points", "channel", "check_points", "combine", "inner_unit", "piecewise", "stamp"]
 
 Array = NDArray[np.float64]
+#: Table of a profile: rows of a time [s] and what holds there.
+Points = Sequence[Sequence[float]]
 #: Attribute of a channel whose values hold until the next one instead of running towards it.
 HELD = {"interpolation": "previous"}
 _EAGER = 2**20  # longer channels are computed chunk by chunk, when they are used

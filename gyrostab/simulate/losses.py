@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,12 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.simulate.channels import check_points, stamp
+from gyrostab.simulate.channels import Points, check_points, stamp
 from gyrostab.simulate.noise import stream
 from gyrostab.windows import duration_seconds
 
 __all__ = ["gaps", "losses", "power_cuts"]
 
-Points = Sequence[Sequence[float]]
 _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
 
 
