@@ -22,7 +22,7 @@ from gyrostab.kernels.expected import expected_powers
 from gyrostab.kernels.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import HOUR, LAWS, TERMS, URAD_PER_S
 
-__all__ = ["NOISE", "assemble", "calibrate", "grid_values", "noise_powers", "white_variance"]
+__all__ = ["NOISE", "assemble", "calibrate", "grid_values", "line_columns", "noise_powers", "white_variance"]
 
 Array = NDArray[np.float64]
 #: Random terms, in the order of the dimension `noise`.
@@ -35,6 +35,18 @@ _EXCESS = 4.0  # standard deviations from which on a block is noisier
 _POWER = "degree2 hour-2 Hz-1"
 
 
+def line_columns(reduced: xr.Dataset) -> Array:
+    """Expected power of every ordinate of a full block for unit squares of Q, N, B, K.
+
+    Returns
+    -------
+    ndarray, shape (line, term)
+        [degree2 hour-2 Hz-1 per squared unit of the noise table].
+    """
+    size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
+    return np.asarray(expected_powers(taper(size), rate, ordinates(size)).T * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR]))
+
+
 def noise_powers(reduced: xr.Dataset) -> Array:
     """Expected band powers for unit squares of Q, N, B, K, as the gaps of each block let them be seen.
 
@@ -43,9 +55,8 @@ def noise_powers(reduced: xr.Dataset) -> Array:
     ndarray, shape (axis, block, band, term)
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
-    size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
-    each = expected_powers(taper(size), rate, ordinates(size)) * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR])[:, None]
-    edges = band_edges(size) - 1
+    each = line_columns(reduced).T
+    edges = band_edges(int(reduced.attrs["block_samples"])) - 1
     whole = np.stack([each[:, low:high].mean(axis=1) for low, high in pairwise(edges)])
     near = reduced["neighbours"].transpose("axis", "block").values
     near = np.where(np.isfinite(near), near, 1.0)[..., None, None]
