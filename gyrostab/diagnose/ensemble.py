@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from gyrostab.diagnose.baseline import line_columns
+from gyrostab.diagnose.baseline import line_columns, white_variance
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times
 from gyrostab.noise import HOUR
 
@@ -23,6 +23,7 @@ __all__ = ["null_records"]
 Array = NDArray[np.float64]
 _CHUNK = 25
 _TAIL = 1e-9  # probability of a second difference beyond the limit that counts as an outlier
+_POOL = 10**6  # samples made one by one
 _COARSE = 1.5  # standard deviations: a lattice step from which on the values are few levels
 
 
@@ -35,7 +36,7 @@ class _Frame(NamedTuple):
     columns: Array
     effects: Array  # expected power over that of the noise alone
     sd: Array  # of a sample and of the difference of two neighbours, by axis
-    memory: Array  # sum of fourth powers of the autocorrelation, by axis
+    tails: Array  # excess kurtosis of a block beyond that of white Gaussian noise, and its scatter over that one's, by axis
 
 
 def null_records(
@@ -71,7 +72,7 @@ def null_records(
     >>> [one.sizes["record"] for one in nulls], nulls[0]["power"].dims
     ([25, 15], ('record', 'axis', 'block', 'band'))
     """
-    frame = _frame(reduced, baseline)
+    frame = _frame(reduced, baseline, rng)
     for first in range(0, count, chunk):
         yield _draw(frame, min(chunk, count - first), rng)
 
@@ -80,19 +81,34 @@ def _ordered(data: xr.Dataset, name: str, *dims: str) -> Array:
     return np.asarray(data[name].transpose(*dims).values)
 
 
-def _frame(reduced: xr.Dataset, baseline: xr.Dataset) -> _Frame:
+def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) -> _Frame:
     columns = _ordered(baseline, "columns", "axis", "block", "band", "noise")
     noise = np.einsum("abfn,an->abf", columns, baseline["square"].values)
     effects = _ordered(baseline, "spectrum", "axis", "block", "band") / noise
     lines = line_columns(reduced)
-    sd, memory = [], []
-    for row in range(len(noise)):
-        density = lines @ baseline["square"].values[row]
-        correlation = np.fft.irfft(np.concatenate([density[:1], density, density[-1:]]))
+    sd = []
+    for square in baseline["square"].values:
+        density = lines @ square
         sd.append([np.sqrt(level) for level in (_variance(reduced, density), 2.0 * _variance(reduced, density, difference=True))])
-        memory.append(float(((correlation / correlation[0]) ** 4).sum()))
+    tails = np.array([_tails(reduced, lines * square, rng) for square in baseline["square"].values])
     shape = _ordered(reduced, "shape", "axis", "block", "band")
-    return _Frame(reduced, baseline, shape, columns, effects, np.array(sd), np.array(memory))
+    return _Frame(reduced, baseline, shape, columns, effects, np.array(sd), tails)
+
+
+def _tails(reduced: xr.Dataset, density: Array, rng: np.random.Generator) -> tuple[float, float]:
+    """Kurtosis of full blocks of this noise (line, term): memory widens its scatter, the rounding of an angle is not Gaussian."""
+    size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
+    shaped = np.zeros(size // 2 + 1)
+    shaped[1 : len(density) + 1] = density[:, 1:].sum(axis=1)
+    many = int(np.clip(_POOL // size, 200, 2000))
+    normal = rng.standard_normal((many, shaped.size, 2)) @ np.array([1.0, 1j])
+    values = np.fft.irfft(normal * np.sqrt(shaped * rate * size / 2.0), n=size, axis=1)
+    rounding = np.sqrt(12.0 * density[:, 0].mean() * rate / 2.0)
+    values += np.diff(rounding * rng.random((many, size + 1)), axis=1)
+    values -= values.mean(axis=1, keepdims=True)
+    kurtosis = (values**4).mean(axis=1) / (values**2).mean(axis=1) ** 2 - 3.0
+    mean, variance, _ = _kurtosis_moments(np.array(float(size)))
+    return float(kurtosis.mean() - mean), float(kurtosis.std() / np.sqrt(variance))
 
 
 def _variance(reduced: xr.Dataset, density: Array, *, difference: bool = False) -> float:
@@ -137,8 +153,9 @@ def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator)
     """Block means: white noise, random walk and flicker as means over the blocks."""
     reduced, baseline = frame.reduced, frame.baseline
     n, step = reduced.sizes["block"], float(reduced.attrs["block_s"])
-    level = np.maximum(squares[..., 1] / np.maximum(baseline["square"].values[:, 1], 1e-300), 0.1)
-    white = np.sqrt(_ordered(baseline, "mean_variance", "axis", "block") * np.minimum(level, 10.0)[..., None])
+    each = np.stack([white_variance(reduced, np.tile(unit, (len(slow[0]), 1))) for unit in np.eye(4)[:2]], axis=-1)
+    level = np.einsum("abn,ran->rab", each, squares[..., :2]) / np.einsum("abn,an->ab", each, baseline["square"].values[:, :2])
+    white = np.sqrt(_ordered(baseline, "mean_variance", "axis", "block") * np.where(np.isfinite(level), level, 1.0))
     times = flicker_times(1.0 / step, low=1.0 / (2.0 * np.pi * 8.0 * n * step))
     total = _ordered(baseline, "known_mean", "axis", "block") + white * rng.standard_normal(white.shape)
     for place in np.ndindex(*white.shape[:2]):
@@ -231,17 +248,22 @@ def _profiles(frame: _Frame, count: int, rng: np.random.Generator) -> Array:
     return np.asarray(noise)
 
 
-def _kurtosis(frame: _Frame, count: int, rng: np.random.Generator) -> Array:
-    """Excess kurtosis of Gaussian samples (Anscombe and Glynn), or that of other blocks where the values are few levels."""
-    reduced = frame.reduced
-    found = _ordered(reduced, "kurtosis", "axis", "block")
-    n = np.maximum(_ordered(reduced, "samples", "axis", "block") / frame.memory[:, None], 20.0)
+def _kurtosis_moments(n: Array) -> tuple[Array, Array, Array]:
+    """Mean and variance of the excess kurtosis of n Gaussian samples, and the degrees of freedom of its law (Anscombe and Glynn)."""
     mean = -6.0 / (n + 1.0)
     variance = 24.0 * n * (n - 2.0) * (n - 3.0) / ((n + 1.0) ** 2 * (n + 3.0) * (n + 5.0))
     skew = 6.0 * (n * n - 5.0 * n + 2.0) / ((n + 7.0) * (n + 9.0)) * np.sqrt(6.0 * (n + 3.0) * (n + 5.0) / (n * (n - 2.0) * (n - 3.0)))
-    a = 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
+    return mean, variance, 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
+
+
+def _kurtosis(frame: _Frame, count: int, rng: np.random.Generator) -> Array:
+    """Excess kurtosis as the noise has it, or that of other blocks where the values are few levels."""
+    reduced = frame.reduced
+    found = _ordered(reduced, "kurtosis", "axis", "block")
+    mean, variance, a = _kurtosis_moments(np.maximum(_ordered(reduced, "samples", "axis", "block").astype(np.float64), 20.0))
     root = 1.0 - 2.0 / (9.0 * a) - rng.standard_normal((count, *found.shape)) * np.sqrt(2.0 / (9.0 * a))
-    out = mean + np.sqrt(variance) * ((1.0 - 2.0 / a) / np.maximum(root, 0.1) ** 3 - 1.0) / np.sqrt(2.0 / (a - 4.0))
+    score = ((1.0 - 2.0 / a) / np.maximum(root, 0.1) ** 3 - 1.0) / np.sqrt(2.0 / (a - 4.0))
+    out = mean + frame.tails[:, :1] + np.sqrt(variance) * frame.tails[:, 1:] * score
     for axis, step in enumerate(reduced["lattice"].values):
         good = found[axis][np.isfinite(found[axis])]
         if step > _COARSE * frame.sd[axis, 0] and good.size:
