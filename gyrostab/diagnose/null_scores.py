@@ -37,7 +37,7 @@ class Tail:
         value = np.asarray(value, dtype=float)
         rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (self.sample.size + 1.0)
         beyond = (value - self.start) / self.scale - np.log(_SHARE)
-        return np.where(value > self.start, beyond, -np.log(np.clip(rank, _SHARE, 1.0)))
+        return np.asarray(np.where(value > self.start, beyond, -np.log(np.clip(rank, _SHARE, 1.0))))
 
     def level(self, p: float) -> float:
         """Value that the largest of a null record reaches with probability `p`."""
@@ -147,13 +147,13 @@ def smallest_p(reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores) -> A
         if scores is not None:
             z = np.abs(np.nan_to_num(standardise(scores, view))).max(axis=(-3, -2, -1))
             p.append(null.p_value(name, z))
-    return np.min(p, axis=0)
+    return np.asarray(np.min(p, axis=0))
 
 
 def standardise(scores: xr.Dataset, null: ViewNull) -> Array:
     """Scores in standard deviations of the null records, below zero where one-sided."""
     z = (scores["z"].values - null.mean) / null.spread
-    return np.maximum(z, 0.0) if scores.attrs["one_sided"] else z
+    return np.asarray(np.maximum(z, 0.0) if scores.attrs["one_sided"] else z)
 
 
 def _tail(largest: Array) -> Tail:

@@ -81,15 +81,22 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     )
 
 
-def allan_surface(reduced: xr.Dataset, baseline: xr.Dataset) -> dict[str, Any]:
+def allan_surface(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows | None = None) -> dict[str, Any]:
     """Observed and expected Allan variance [degree2 hour-2] by (record), axis, window, tau, and the shape of their gamma law.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        As for `score`; the known mean is taken off before.
+    windows : Windows, optional
+        Those of `score` by default.
 
     Returns
     -------
     dict
         ``observed``, ``expected``, ``shape``; ``windows``; ``columns`` as for `view_dataset`.
     """
-    windows = window_set(reduced.sizes["block"], LENGTHS)
+    windows = window_set(reduced.sizes["block"], LENGTHS) if windows is None else windows
     parts = [_inside(reduced, baseline, windows), _beyond(reduced, baseline, windows)]
     joined: dict[str, Any] = {"windows": windows}
     for name in ("observed", "expected", "shape"):

@@ -9,14 +9,13 @@ import xarray as xr
 
 from gyrostab.diagnose.views.cells import Array, Windows, over_windows, values_of, view_dataset, window_set
 from gyrostab.kernels.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
+from gyrostab.kernels.state_space import flicker_states
+from gyrostab.noise import HOUR
 
-__all__ = ["LENGTHS", "MeanNoise", "box_mean", "mean_noise", "precision", "score"]
+__all__ = ["LENGTHS", "MeanNoise", "box_mean", "mean_noise", "precision", "score", "window_means"]
 
 #: Lengths of the windows [blocks].
 LENGTHS = (1, 5, 15, 45)
-_SPACING = 4.0  # of the time constants that make up flicker noise
-#: Variance of each of the relaxing processes for B = 1.
-FLICKER_SHARE = np.log(_SPACING) / np.pi
 
 
 class MeanNoise(NamedTuple):
@@ -47,15 +46,9 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         See `gyrostab.diagnose.views.cells.view_dataset`; ``estimate`` is the constant [degree hour-1].
     """
     windows = window_set(reduced.sizes["block"], LENGTHS, whole=False)
-    residual = values_of(reduced, "mean", "axis", "block") - values_of(baseline, "known_mean", "axis", "block")
-    z, estimate = (np.full((*residual.shape[:-1], windows.first.size, 1), np.nan) for _ in range(2))
-    for axis in range(reduced.sizes["axis"]):
-        present = np.isfinite(residual[..., axis, :]).reshape(-1, residual.shape[-1]).any(axis=0)
-        noise = mean_noise(reduced, baseline, axis, present)
-        amount, information = _matched(residual[..., axis, :], noise, windows)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z[..., axis, :, 0] = amount / np.sqrt(information)
-            estimate[..., axis, :, 0] = amount / information
+    amount, information = window_means(reduced, baseline, windows)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z, estimate = (amount / np.sqrt(information))[..., None], (amount / information)[..., None]
     block = float(reduced.attrs["block_s"])
     return view_dataset(
         "mean",
@@ -68,6 +61,31 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         estimate=estimate,
         units="degree hour-1",
     )
+
+
+def window_means(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:
+    """Matched filter of every window and its information: their ratio is the constant that stands in the window alone.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        As for `score`.
+    windows : Windows
+        Not the whole record, which says nothing beside its own constant.
+
+    Returns
+    -------
+    amount, information : ndarray ((record,) axis, window), (axis, window)
+        [degree-1 hour], [degree-2 hour2]; NaN where too little of the window is there.
+    """
+    residual = values_of(reduced, "mean", "axis", "block") - values_of(baseline, "known_mean", "axis", "block")
+    amount = np.full((*residual.shape[:-1], windows.first.size), np.nan)
+    information = np.full((residual.shape[-2], windows.first.size), np.nan)
+    for axis in range(residual.shape[-2]):
+        present = np.isfinite(residual[..., axis, :]).reshape(-1, residual.shape[-1]).any(axis=0)
+        noise = mean_noise(reduced, baseline, axis, present)
+        amount[..., axis, :], information[axis] = _matched(residual[..., axis, :], noise, windows)
+    return amount, information
 
 
 def _matched(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array, Array]:
@@ -102,14 +120,14 @@ def mean_noise(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, present: Ar
     begin, end = reduced["begin"].values, reduced["end"].values
     step = np.diff((begin + end) / 2.0, append=end[-1])
     block, span = float(reduced.attrs["block_s"]), float(end[-1] - begin[0])
-    times = block * _SPACING ** np.arange(max(1, round(np.log(span / block) / np.log(_SPACING))) + 1)
+    share, times, white = flicker_states(block, span)
     decay = np.exp(-step[:, None] / times)
-    variance = baseline["mean_variance"].transpose(..., "axis", "block").values[axis].astype(float)
+    variance = baseline["mean_variance"].transpose(..., "axis", "block").values[axis] + b**2 * white
     present = present & np.isfinite(variance) & (variance > 0)
     n = variance.size
     innovation, gain = np.empty(n), np.empty((n, times.size + 1))
     remaining = np.empty((n + 1, times.size + 1, times.size + 1))
-    filter_gains(variance, present, k**2 * step / 3600.0, np.full(times.size, b**2 * FLICKER_SHARE), decay, innovation, gain)
+    filter_gains(variance, present, k**2 * step / HOUR, b**2 * share, decay, innovation, gain)
     remaining_information(innovation, gain, decay, remaining)
     return MeanNoise(present.astype(float), innovation, gain, decay, remaining)
 
