@@ -7,7 +7,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from operator import itemgetter
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -130,11 +130,12 @@ def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = F
 def fill_parts(rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]) -> None:
     """Samples of one row from `begin` on, as the tasks of `lay` make them."""
     found = [one for part in rows[row] for one in _reaching(part, begin, begin + out.size)]
-    done = 0
-    for _, _, _, at, length in sorted(found, key=itemgetter(3)):
-        out[done:at] = np.nan  # nothing where at is before
-        done = max(done, at + length)
-    out[done:] = np.nan
+    ends = sorted((at, at + length) for *_, at, length in found)
+    if any(stop > start for (_, stop), (start, _) in pairwise(ends)):
+        out[:] = np.nan  # what two have is filled up
+    else:
+        for (_, stop), (start, _) in pairwise([(0, 0), *ends, (out.size, 0)]):
+            out[stop:start] = np.nan
     taken: list[tuple[int, int]] = []
     for array, own_row, own, at, length in found:
         here = out[at : at + length]

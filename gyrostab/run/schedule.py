@@ -106,9 +106,11 @@ def open_pool(scheduler: str, *, workers: int | None = None, files: Sequence[Pat
         from dask.system import CPU_COUNT
 
         count = workers or CPU_COUNT
-        executor = ThreadPoolExecutor(count) if scheduler == "threads" else _processes(count)
+        remote = scheduler == "processes"
+        executor = _processes(count) if remote else ThreadPoolExecutor(count)
+        submit: Callable[..., Future[Any]] = executor.submit
         try:
-            yield Pool(executor.submit, lambda: count, scheduler == "processes", _same)
+            yield Pool(partial(submit, _noted) if remote else submit, lambda: count, remote, _same)
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
     else:
@@ -134,6 +136,21 @@ def _begin_process(parent: int) -> None:
 
     threading.Thread(target=watch, daemon=True).start()
     warnings.showwarning = lambda message, *_: None  # the parent opens the same files and says the same
+
+
+class _Noted(NamedTuple):
+    """What a call in another process gave, and what it warned of."""
+
+    result: Any
+    notes: list[str]
+
+
+def _noted(function: Callable[..., Any], *arguments: Any) -> _Noted:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", UserWarning)
+        result = function(*arguments)
+    return _Noted(result, [str(one.message) for one in caught])
 
 
 @contextlib.contextmanager
@@ -249,7 +266,12 @@ def in_any_order(pool: Pool, calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple
 
 def _result(future: Future[Any]) -> Any:
     try:
-        return future.result()
+        found = future.result()
+        if not isinstance(found, _Noted):
+            return found
+        for note in found.notes:
+            warnings.warn(note, stacklevel=2)
+        return found.result
     except GyrostabError:
         raise
     except BrokenProcessPool as error:

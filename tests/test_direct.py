@@ -1,0 +1,167 @@
+"""Samples read without dask are those that dask gives, bit for bit, and what a run leaves out of its way changes nothing."""
+
+import json
+import warnings
+
+import dask.array as da
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab import make_log, open_product, to_netcdf, to_zarr
+from gyrostab.export import open_log
+from gyrostab.fit import fit_noise, fit_part
+from gyrostab.join import join_logs
+from gyrostab.join.lazy import lay
+from gyrostab.run import checkpoint, load_log, run
+from gyrostab.store import read
+from gyrostab.store.direct import can_fill, fill_row
+from gyrostab.store.header import read_header
+
+WINDOW = {"window": "40s", "step": "10s", "taus": "8"}
+
+
+@st.composite
+def placed(draw):
+    """Rows of arrays with gaps, on stretches of a grid that may overlap; and the size of the grid."""
+    size = draw(st.integers(1, 60))
+    rows = []
+    for _ in range(draw(st.integers(1, 2))):
+        parts = []
+        for _ in range(draw(st.integers(1, 4))):
+            values = np.array(draw(st.lists(st.sampled_from([1.5, -2.0, np.nan]), min_size=1, max_size=40)))
+            length = draw(st.integers(1, min(values.size, size)))
+            cut = draw(st.integers(1, length))
+            first, own = draw(st.integers(0, size - length)), draw(st.integers(0, values.size - length))
+            runs = [[first, own, cut], [first + cut, own + cut, length - cut]]
+            parts.append((values, None, np.array(runs[: 1 + (cut < length)], dtype=np.int64)))
+        rows.append(parts)
+    return rows, size
+
+
+@settings(deadline=None)
+@given(placed(), st.data())
+def test_joined_samples_are_those_of_dask(made, data):
+    rows, size = made
+    joined = lay(rows, size, data.draw(st.integers(1, size)))
+    assert can_fill(joined)
+    begin = data.draw(st.integers(0, size))
+    for row, expected in enumerate(joined.compute(scheduler="synchronous")):
+        found = np.full(data.draw(st.integers(0, size - begin)), 7.0)
+        fill_row(joined, row, begin, found)
+        np.testing.assert_array_equal(found, expected[begin : begin + found.size])
+
+
+def test_what_is_derived_from_an_array_is_not_read_past_dask():
+    joined = lay([[(np.arange(9.0), None, np.array([[0, 0, 9]]))]], 9, 4)
+    doubled = 2.0 * joined
+    assert not can_fill(doubled)
+    assert not can_fill(joined[:, 1:])
+    found = np.empty(3)
+    fill_row(doubled, 0, 4, found)
+    np.testing.assert_array_equal(found, [8.0, 10.0, 12.0])
+
+
+def stored_logs(folder, form):
+    """Three logs of counts with gaps, a slow channel, and an overlap of the last two."""
+    rng = np.random.default_rng(4)
+    paths = []
+    for number, begin in enumerate((0, 70_000, 130_000)):
+        values = 0.02 * np.rint(100.0 * rng.standard_normal((2, 80_000)))
+        values[:, 30_000:31_000] = np.nan
+        start = str(np.datetime64("2026-02-01") + np.timedelta64(begin * 10, "ms"))
+        log = make_log(values, rate=100.0, unit="deg/h", start=start)
+        log.rate.encoding = {"dtype": "int32", "scale_factor": 0.02}
+        log = log.assign_coords(time_temperature=log["time"].values[::20])
+        log["temperature"] = ("time_temperature", rng.standard_normal(4000), {"units": "degree_Celsius"})
+        paths.append({"nc": to_netcdf, "zarr": to_zarr}[form](log.chunk(time=65_536), folder / f"{number}.{form}"))
+    return paths
+
+
+def opened(paths):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return load_log(paths)
+
+
+@pytest.mark.parametrize("form", ["nc", "zarr"])
+def test_stored_samples_are_those_of_dask(tmp_path, form):
+    log = opened(stored_logs(tmp_path, form))
+    rng = np.random.default_rng(5)
+    for name in ("rate", "temperature"):
+        data = log[name].data
+        assert isinstance(data, da.Array)
+        assert can_fill(data)
+        whole = np.atleast_2d(data.compute())
+        for begin, end in np.sort(rng.integers(0, data.shape[-1] + 1, (20, 2)), axis=1).tolist():
+            for row, expected in enumerate(whole):
+                found = np.full(end - begin, 7.0)
+                fill_row(data, row, begin, found)
+                np.testing.assert_array_equal(found, expected[begin:end])
+
+
+def test_a_zarr_log_is_opened_as_xarray_opens_it(tmp_path, monkeypatch):
+    path = stored_logs(tmp_path, "zarr")[0]
+    assert read_header(path) is not None
+    quick = open_log(path)
+    monkeypatch.setattr(read, "read_header", lambda path: None)
+    slow = open_log(path)
+    xr.testing.assert_identical(quick.compute(), slow.compute())
+    assert list(quick.variables) == list(slow.variables)
+    assert quick.rate.encoding == slow.rate.encoding
+
+
+@pytest.mark.parametrize("how", ["cut", "other order", "no attributes"])
+def test_a_zarr_log_that_is_not_as_expected_is_left_to_xarray(tmp_path, how):
+    path = stored_logs(tmp_path, "zarr")[0]
+    if how == "cut":
+        chunk = path / "time_temperature" / "0"
+        chunk.write_bytes(chunk.read_bytes()[:-20])
+    else:
+        layout = json.loads((path / ".zmetadata").read_text())
+        if how == "other order":
+            layout["metadata"]["rate/.zarray"]["order"] = "F"
+        else:
+            del layout["metadata"]["rate/.zattrs"]
+        (path / ".zmetadata").write_text(json.dumps(layout))
+    assert read_header(path) is None
+
+
+def test_a_large_product_is_that_of_the_small_way(tmp_path, monkeypatch):
+    paths = stored_logs(tmp_path, "zarr")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        run(paths, tmp_path / "small.nc", windows=WINDOW)
+        monkeypatch.setattr(checkpoint, "_SMALL", 0)
+        run(paths, tmp_path / "large.nc", windows=WINDOW)
+    small, large = (open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False) for name in ("small", "large"))
+    xr.testing.assert_identical(small, large)
+
+
+@pytest.mark.parametrize("options", [{}, {"terms": "NK"}, {"method": "adev"}, {"tau_min": "0.1s"}])
+def test_a_part_is_fitted_as_the_whole(options):
+    from gyrostab import davar
+
+    rng = np.random.default_rng(6)
+    values = rng.standard_normal((2, 40_000))
+    values[0, rng.integers(0, 40_000, 4000)] = np.nan
+    surface = davar(make_log(values, rate=100.0, unit="deg/h"), **WINDOW)
+    xr.testing.assert_identical(fit_part(surface, **options), fit_noise(surface.chunk(time=5), **options).compute())
+
+
+def test_worker_processes_tell_of_damage_as_threads_do(tmp_path):
+    path = stored_logs(tmp_path, "zarr")[0]
+    (path / "rate" / "1.0").unlink()
+    for scheduler in ("threads", "processes"):
+        with pytest.warns(UserWarning, match=r"axis y: the chunk from .* is missing: no file rate/1\.0"):
+            run([path], tmp_path / f"{scheduler}.nc", windows=WINDOW, scheduler=scheduler, workers=1)
+
+
+def test_logs_in_memory_join_as_before():
+    parts = [make_log(np.full(4, float(n)), rate=1.0, unit="deg/h", start=f"2026-01-01T00:00:0{3 * n}") for n in range(2)]
+    joined = join_logs(parts, ["a.nc", "b.nc"]).rate.data
+    found = np.empty(7)
+    fill_row(joined, 0, 0, found)
+    np.testing.assert_array_equal(found, joined.compute()[0])
