@@ -16,7 +16,7 @@ from gyrostab.read.overlap import drop_repeats
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store import common_packing
 
-__all__ = ["attach_channels", "concatenate", "memory", "to_disk"]
+__all__ = ["attach_channels", "concatenate", "memory", "to_disk", "with_channels"]
 
 
 def memory(part: xr.Dataset) -> int:
@@ -50,15 +50,24 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     if len(parts) == 1:
         joined = parts[0]
     else:
-        ordered = _in_order(parts)
-        signal = _signal(ordered)
+        whole = _in_order(parts)
+        signal = _signal(whole)
+        own = [_off_rows(part) for part in whole]
+        ordered = [part.drop_vars([*names, *(f"time_{name}" for name in names)]) for part, names in zip(whole, own, strict=True)]
         if "time" in ordered[0].variables:
             ordered = drop_repeats(ordered)
         joined = _join(ordered, signal)
+        apart = [part[names] for part, names in zip(whole, own, strict=True) if names]
+        joined = with_channels(joined, apart)
     if joined.sizes["row"] < 2:
         name = joined.attrs["source_files"][0]
         raise FormatError(f"{name}: there is one row of data only; a log needs two at least")
     return joined
+
+
+def _off_rows(part: xr.Dataset) -> list[str]:
+    """Channels that have a time of their own."""
+    return [str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)]
 
 
 def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
@@ -165,6 +174,11 @@ def _dask() -> Any:
     import dask.array
 
     return dask.array
+
+
+def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Add the channels of other tables of the same files, each on its own ``time_<channel>``; the log's attributes stay as they are."""
+    return attach_channels(log, sources).drop_attrs(deep=False).assign_attrs(log.attrs) if sources else log
 
 
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
