@@ -142,6 +142,9 @@ def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-unty
 
 def full_counts(window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:
     """Terms of each window without gaps, (n_windows, n_tau)."""
+    lengths = window - 2 * ks + 1
+    if not shifts.any():
+        return np.tile(lengths.astype(np.float64), (n_windows, 1))
     up = (1 << shifts) - 1
     first = step * np.arange(n_windows)[:, None] + up
-    return (((first + window - 2 * ks + 1) >> shifts) - (first >> shifts)).astype(np.float64)
+    return (((first + lengths) >> shifts) - (first >> shifts)).astype(np.float64)

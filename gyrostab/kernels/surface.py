@@ -216,7 +216,7 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
         if not unit.zero_fill and not unit.angle and poor.any():
             strides = cluster_strides(unit.window, unit.ks, unit.shifts)
             _bridge_gaps(angle.flat[: angle.points], starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
-    if not unit.zero_fill:
+    if gaps and not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
         cells[0][blank] = cells[5][blank] = cells[6][blank] = np.nan
         cells[4][blank] = NONE

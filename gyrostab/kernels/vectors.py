@@ -81,17 +81,26 @@ def _add_square(builder: Any, where: Any, value: Any) -> None:
     builder.store(builder.fadd(builder.load(where), builder.fmul(value, value, flags=_FAST), flags=_FAST), where)
 
 
-def _total(builder: Any, parts: list[Any]) -> Any:
-    """Sum of all elements of some vectors, halves first."""
-    vector = builder.load(parts[0])
-    for part in parts[1:]:
-        vector = builder.fadd(vector, builder.load(part))
+def _halves(builder: Any, first: Any, second: Any, width: int) -> Any:
+    """Two vectors as one: in each group of `width` elements the halves are added, those of the two vectors side by side."""
+    low = [at for at in range(2 * LANES) if at % width < width // 2]
+    left, right = (builder.shuffle_vector(first, second, _places([at + by for at in low])) for by in (0, width // 2))
+    return builder.fadd(left, right)
+
+
+def _totals(builder: Any, sums: list[list[Any]]) -> Any:
+    """Sums of all elements of eight vectors as one vector, halves first; each vector is given in parts."""
+    vectors = []
+    for parts in sums:
+        vector = builder.load(parts[0])
+        for part in parts[1:]:
+            vector = builder.fadd(vector, builder.load(part))
+        vectors.append(vector)
     width = LANES
-    while width > 1:
+    while len(vectors) > 1:
+        vectors = [_halves(builder, vectors[at], vectors[at + 1], width) for at in range(0, len(vectors), 2)]
         width //= 2
-        low, high = (builder.shuffle_vector(vector, vector, _places(list(range(at, at + width)))) for at in (0, width))
-        vector = builder.fadd(low, high)
-    return builder.extract_element(vector, ir.Constant(_SHORT, 0))
+    return vectors[0]
 
 
 def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: list[Any]) -> list[Any]:
@@ -131,7 +140,11 @@ def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: l
                 _add_square(builder, heads[lag][0], builder.select(before, value, nothing))
                 _add_square(builder, tails[lag][0], builder.select(before, nothing, value))
             builder.store(advanced(LANES), position)
-    return [_total(builder, sums) for sums in heads + tails]
+    # eight rows, those that no lag has filled with those of another
+    rows = [sums[lag % len(lags)] for sums in (heads, tails) for lag in range(LANES // 2)]
+    found = _totals(builder, rows)
+    places = [lag + part * LANES // 2 for part in range(2) for lag in range(len(lags))]
+    return [builder.extract_element(found, ir.Constant(_SHORT, place)) for place in places]
 
 
 def _of_lags(count: int) -> Any:
