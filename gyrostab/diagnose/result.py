@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.sentences import next_measurement, summary
 from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import Effect
@@ -62,8 +63,13 @@ class Diagnosis:
 
     def __str__(self) -> str:
         """The verdict, and a sentence for each effect and each mismatch that none explains."""
-        lines = [f"{self.verdict}"]
-        lines += [f"- {effect['statement']}" for effect in self.effects]
+        lines = [f"{self.verdict}: {summary(self.content)}"]
+        for effect in self.effects:
+            gain = effect["held_out_gain"]
+            lines.append(f"- {effect['name']}: {effect['statement']}")
+            lines.append(f"  predicts time kept apart better by {gain['nats']:.3g} nats; chance reaches {gain['threshold']:.2g}")
+            if step := next_measurement(effect["name"], effect["alternatives"]):
+                lines.append(f"  {step}")
         left = set(self.content["unexplained"])
         lines += [f"- unexplained: {box['statement']}" for box in self.mismatches if box["id"] in left]
         return "\n".join(lines)
@@ -106,6 +112,7 @@ _FIELDS: dict[str, dict[str, Any]] = {
         "files": list, "axes": list, "start": str, "end": str, "sampling_rate_hz": _NUMBER, "channels": list, "missing_share": _NUMBER,
     },
     "baseline": {"source": str, "noise": dict, "calibrated_on": list},
+    "noise": {"value": _NUMBER, "stderr": _LATER, "unit": str},
     "mismatch": {
         "id": int, "view": str, "axes": list, "start": str, "end": str, "tau_min_s": _LATER, "tau_max_s": _LATER, "ratio": _LATER,
         "p_value": _NUMBER, "explained_by": list, "statement": str,
@@ -188,8 +195,9 @@ def _check_baseline(baseline: Mapping[str, Any]) -> None:
     for axis, terms in baseline["noise"].items():
         for term, entry in terms.items():
             where = f"baseline.noise.{axis}.{term}"
-            if term not in TERMS or {"value", "stderr", "unit"} - set(entry):
-                raise SchemaError(f"diagnosis: {where} is {entry!r}; it needs value, stderr and unit of one of {', '.join(TERMS)}")
+            if term not in TERMS:
+                raise SchemaError(f"diagnosis: {where} is no noise term; there are {', '.join(TERMS)}")
+            _require(entry, "noise", where)
     for span in baseline["calibrated_on"]:
         _times(span, "baseline.calibrated_on")
 
@@ -291,7 +299,12 @@ def _pairs(table: Mapping[str, Any]) -> list[str]:
 
 
 def _key(key: str) -> str:
-    return key if key and all(letter.isascii() and (letter.isalnum() or letter in "_-") for letter in key) else json.dumps(key)
+    return key if key and all(letter.isascii() and (letter.isalnum() or letter in "_-") for letter in key) else _quoted(key)
+
+
+def _quoted(text: str) -> str:
+    """A basic string of TOML: as that of JSON, but for DEL, and for halves of surrogate pairs, which have no place in a file."""
+    return json.dumps(text.encode("utf-8", "replace").decode("utf-8"), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _value(value: Any) -> str:
@@ -305,4 +318,4 @@ def _value(value: Any) -> str:
         return "nan" if math.isnan(value) else repr(value)
     if isinstance(value, list | tuple | np.ndarray):
         return f"[{', '.join(_value(item) for item in value)}]"
-    return json.dumps(str(value), ensure_ascii=False)
+    return _quoted(str(value))

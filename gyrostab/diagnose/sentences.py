@@ -252,33 +252,29 @@ def next_measurement(name: str, alternatives: Sequence[str]) -> str:
     return begin + "; or ".join(steps[:2] if alternatives else steps[:1]) + "."
 
 
-def effect_statement(
-    said: str, *, alternatives: Sequence[str], gain: float, threshold: float, intervals: Sequence[str] = (), name: str = ""
-) -> str:
-    """A sentence on a named effect: what it does, how sure that is, what else it could be, and what to measure next.
+def effect_statement(said: str, *, alternatives: Sequence[str] = (), intervals: Sequence[str] = ()) -> str:
+    """What a named effect does and when, and what the record cannot tell it from.
 
     Parameters
     ----------
     said : str
         What `Effect.say` says, with its numbers.
     alternatives : sequence of str
-        Names of the effects that the record cannot tell from it.
-    gain, threshold : float
-        Held-out gain and what a null record reaches [nat].
+        Names of the effects that look the same in this record.
     intervals : sequence of str
         When it acts, from `span_text`.
-    name : str
-        Name of the effect.
+
+    Examples
+    --------
+    >>> effect_statement("The bias jumps on axis x.", alternatives=["telegraph"], intervals=["from 1:00 to 2:00 after the start"])
+    'The bias jumps on axis x. It shows from 1:00 to 2:00 after the start. This record cannot tell it from a bias that
+     switches between two levels.'
     """
     parts = [said]
     if intervals:
         parts.append(f"It shows {', and '.join(intervals)}.")
-    parts.append(f"It predicts time that was kept apart better by {gain:.3g} nats; chance reaches {threshold:.2g}.")
     if alternatives:
-        listed = ", or ".join(f"{plain_name(one)} ({one})" for one in alternatives)
-        parts.append(f"This record cannot tell it from {listed}.")
-    if step := next_measurement(name, alternatives):
-        parts.append(step)
+        parts.append(f"This record cannot tell it from {', or '.join(plain_name(one) for one in alternatives)}.")
     return " ".join(parts)
 
 

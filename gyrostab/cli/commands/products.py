@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from gyrostab.cli.frame import Output, Product, app, work
+from gyrostab.errors import OptionError
 from gyrostab.options import ChannelFile, Common
 
 __all__ = ["correlate", "export", "plot", "report"]
@@ -22,19 +23,20 @@ def report(
     log: Path | None = None,
     common: Common = Common(),
 ) -> None:
-    """Make one self-contained HTML page of a product, with figures.
+    """Make one self-contained HTML page of a product or of a diagnosis, with figures.
 
     Example: gyrostab report product.nc -o report.html --log run7.nc
 
     Parameters
     ----------
     product
-        File that gyrostab run or gyrostab fit wrote.
+        File that gyrostab run or gyrostab fit wrote, or folder that gyrostab diagnose wrote.
     output
         HTML file to write.
     log
         Log that the product was made of, to show the signal too.
     """
+    from gyrostab.diagnosis import open_diagnosis, write_diagnosis_report
     from gyrostab.export import open_log, open_product
     from gyrostab.report import write_report
     from gyrostab.run import check_output
@@ -42,6 +44,12 @@ def report(
     target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite, inputs=[product])
     with work(common) as stage:
         stage("drawing", 0)
+        if product.is_dir() and (product / "diagnosis.json").exists():
+            if log is not None:
+                raise OptionError("--log is for the report of a product; a diagnosis holds what its report shows")
+            write_diagnosis_report(open_diagnosis(product), target, overwrite=common.overwrite)
+            print(target)
+            return
         write_report(open_product(product), target, log=open_log(log) if log else None, overwrite=common.overwrite)
     print(target)
 
