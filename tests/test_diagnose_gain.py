@@ -67,6 +67,8 @@ def power_case(n: int, bands: int, *, records: int, seed: int = 2, axes: str = "
         {
             "spectrum": (dims, spectrum),
             "columns": ((*dims, "noise"), tall),
+            "shape_alone": (dims, shape),
+            "common": (("axis", "block"), np.where(rng.random((len(axes), n)) < 0.5, 0.0, 0.03)),
             "square": (("axis", "noise"), np.broadcast_to(square, (len(axes), 4))),
             "square_stderr": (("axis", "noise"), np.broadcast_to(0.05 * square, (len(axes), 4))),
         },
@@ -155,13 +157,14 @@ def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(tier):
     weight = data["shape"].values[0].ravel()
     cells = np.isfinite(weight)
     Z = level.reshape(-1, 4)
-    W = np.diag(weight[cells])
+    shared = np.kron(np.diag(baseline["common"].values[0]), np.ones((bands, bands)))
+    W = np.linalg.inv(np.diag(1.0 / weight[cells]) + shared[np.ix_(cells, cells)])
     middle = W - W @ Z[cells] @ np.linalg.solve(Z[cells].T @ W @ Z[cells] + precision, Z[cells].T @ W)
     for record in range(2):
         y = (data["power"] / baseline["spectrum"] - 1.0).values[record, 0].ravel()
         for number, subset in list(enumerate(fold_subsets(fold_blocks(data))))[record::4]:
             use = cells & np.repeat(subset, bands)
-            V = np.diag(1.0 / weight[use]) + Z[use] @ np.linalg.solve(precision, Z[use].T)
+            V = np.diag(1.0 / weight[use]) + shared[np.ix_(use, use)] + Z[use] @ np.linalg.solve(precision, Z[use].T)
             base = density(y[use], V, False)
             for place, design in enumerate(designs, start=1):
                 X = design.reshape(n * bands, -1)

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.posterior import Posterior, fit_squares, floor_square, noise_posterior, scales, summed
+from gyrostab.diagnose.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
 from gyrostab.diagnose.products import mean_products
 from gyrostab.diagnose.quiet import loudness, quiet_blocks, quiet_spans
 from gyrostab.errors import SchemaError
@@ -22,7 +22,7 @@ from gyrostab.kernels.expected import expected_powers
 from gyrostab.kernels.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import HOUR, LAWS, TERMS, URAD_PER_S
 
-__all__ = ["NOISE", "assemble", "calibrate", "grid_values", "line_columns", "noise_powers", "white_variance"]
+__all__ = ["NOISE", "assemble", "calibrate", "common_variance", "grid_values", "line_columns", "noise_powers", "white_variance"]
 
 Array = NDArray[np.float64]
 #: Random terms, in the order of the dimension `noise`.
@@ -61,6 +61,26 @@ def noise_powers(reduced: xr.Dataset) -> Array:
     near = reduced["neighbours"].transpose("axis", "block").values
     near = np.where(np.isfinite(near), near, 1.0)[..., None, None]
     return np.asarray(near * whole + (1.0 - near) * each.mean(axis=1))
+
+
+def common_variance(reduced: xr.Dataset) -> tuple[Array, Array]:
+    """Relative variance that all band powers of a block have in common through random gaps, and the shape of what is left.
+
+    Returns
+    -------
+    common : ndarray, shape (axis, block)
+    shape : ndarray, shape (axis, block, band)
+        Of the gamma distribution of each power when the common factor is known.
+    """
+    shape = reduced["shape"].transpose("axis", "block", "band").values
+    near = reduced["neighbours"].transpose("axis", "block").values
+    samples = np.maximum(reduced["samples"].transpose("axis", "block").values, 1)
+    scattered = np.clip(1.0 - np.where(np.isfinite(near), near, 1.0), 0.0, 1.0)
+    weights = taper(int(reduced.attrs["block_samples"]))
+    scattered = np.maximum(scattered - (1.0 - float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())), 0.0)
+    common = 2.0 * scattered / samples
+    common = np.minimum(common, 0.8 / np.where(np.isfinite(shape), shape, 0.0).max(axis=2, initial=1e-9))
+    return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
 
 
 def white_variance(reduced: xr.Dataset, square: Array) -> Array:
@@ -115,11 +135,14 @@ def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``coefficient`` and ``stderr`` (axis, term) [units of the noise table]; a ramp is an effect, so R is 0, with the error that a ramp
-        would have. ``quiet(axis, block)``; ``spectrum(axis, block, band)``, the expected power [degree2 hour-2 Hz-1]; ``known_mean`` and
-        ``mean_variance`` (axis, block); ``grid_K``, ``grid_B``, ``grid_prior``, ``grid_calibrated`` (axis, grid), noise that is possible
-        and its log weights; ``columns(axis, block, band, noise)``, ``square``, ``square_stderr`` (axis, noise): the spectrum in its
-        terms; ``posterior(axis, draw, noise)`` and ``posterior_slow(axis, draw, slow)``: draws of the squares in powers and means.
+        - ``coefficient``, ``stderr`` (axis, term) [units of the noise table]; a ramp is an effect, so R is 0, with the error that it has.
+        - ``quiet(axis, block)``: what it was calibrated on.
+        - ``spectrum(axis, block, band)``: expected power [degree2 hour-2 Hz-1]; its terms in ``columns(axis, block, band, noise)``,
+          ``square`` and ``square_stderr`` (axis, noise).
+        - ``common(axis, block)``, ``shape_alone(axis, block, band)``: scatter of the powers of a block, together and apart.
+        - ``known_mean``, ``mean_variance`` (axis, block) [degree hour-1, degree2 hour-2].
+        - ``grid_K``, ``grid_B``, ``grid_prior``, ``grid_calibrated`` (axis, grid): possible noise of the means, log weights.
+        - ``posterior(axis, draw, noise)``, ``posterior_slow(axis, draw, slow)``: draws of the squares in powers and in means.
 
     Raises
     ------
@@ -140,6 +163,7 @@ def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     """
     chosen, reason = quiet_blocks(reduced, quiet)
     columns = noise_powers(reduced)
+    common, rest = common_variance(reduced)
     power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
     mean = reduced["mean"].transpose("axis", "block").values
     step = float(reduced.attrs["block_s"])
@@ -151,11 +175,19 @@ def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
                 f"axis {axis}: the quiet blocks hold spectra in {fit.power.size} bands, too few to calibrate on; "
                 "name other quiet time, or diagnose a part of the record with fewer gaps"
             )
+        fit = _with_common(fit, shape[row][chosen[row]], rest[row][chosen[row]], common[row][chosen[row]])
         first = white_variance(reduced, np.tile(np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0]), (len(mean), 1)))[row]
         present = chosen[row] & np.isfinite(mean[row])
         found.append(noise_posterior(fit, mean[row], first, present, step=step, draws=_DRAWS, rng=np.random.default_rng(row)))
     attrs = {"source": "calibrated", "calibrated_on": quiet_spans(reduced, chosen), "quiet_by": reason}
     return assemble(reduced, found, columns, quiet=chosen, attrs=attrs)
+
+
+def _with_common(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
+    """Fit whose weights are less by what the common part of the bands takes from them together."""
+    each = np.nansum(rest, axis=1)
+    known = (each / (1.0 + common * each)).sum()
+    return fit._replace(weight=fit.weight * min(1.0, float(known / max(np.nansum(shape), 1e-300))))
 
 
 def assemble(
@@ -194,6 +226,7 @@ def assemble(
     span = reduced.sizes["block"] * float(reduced.attrs["block_s"])
     grids = [_grid(one, max(one.square[1], least) * HOUR, span) for one, least in zip(found, floor, strict=True)]
     draws = np.stack([one.draws for one in found])
+    common, rest = common_variance(reduced)
     value, error = _coefficients(found)
     value[:, 4], error[:, 4] = 0.0, _ramp_error(reduced, white, value, quiet)
     plane, cube = ("axis", "block"), ("axis", "block", "band")
@@ -205,6 +238,8 @@ def assemble(
         "spectrum": (cube, expected, {"long_name": "expected power", "units": _POWER}),
         "known_mean": (plane, np.zeros(quiet.shape) if known_mean is None else known_mean, {"units": "degree hour-1"}),
         "mean_variance": (plane, variance, {"long_name": "white variance of the block mean", "units": "degree2 hour-2"}),
+        "common": (plane, common, {"long_name": "relative variance that the powers of a block have in common", "units": "1"}),
+        "shape_alone": (cube, rest, {"long_name": "shape of the gamma distribution of a power beside the common part", "units": "1"}),
         "columns": ((*cube, "noise"), columns, {"long_name": "expected power per squared coefficient", "units": _POWER}),
         "square": (("axis", "noise"), square, {"long_name": "squared coefficient that fits the powers", "units": f"square of {told}"}),
         "square_stderr": (("axis", "noise"), np.stack([one.error for one in found]), {"units": f"square of {told}"}),

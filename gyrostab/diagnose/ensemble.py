@@ -125,7 +125,9 @@ def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
     squares = np.stack([baseline["posterior"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1)
     slow = np.stack([baseline["posterior_slow"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1)
     expected = np.einsum("abfn,ran->rabf", frame.columns, squares) * frame.effects
-    power = _gamma(frame.shape, expected, rng)
+    power = _gamma(baseline["shape_alone"].values, expected, rng)
+    common = baseline["common"].values
+    power *= _gamma(np.where(common > 0.0, 1.0 / np.where(common > 0.0, common, 1.0), np.inf), np.ones(power.shape[:3]), rng)[..., None]
     power[..., np.isnan(_ordered(reduced, "power", "axis", "block", "band"))] = np.nan
     found: dict[str, Any] = {
         "mean": (("axis", "block"), _means(frame, squares, slow, rng)),
@@ -146,7 +148,8 @@ def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
 
 def _gamma(shape: Array, mean: Array, rng: np.random.Generator) -> Array:
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
-    return np.asarray(rng.standard_gamma(np.broadcast_to(safe, mean.shape)) / safe * mean)
+    drawn = rng.standard_gamma(np.broadcast_to(safe, mean.shape)) / safe
+    return np.asarray(np.where(np.isinf(shape), 1.0, drawn) * mean)
 
 
 def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator) -> Array:

@@ -20,7 +20,18 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.products import WIDTHS, Array, Products, evidence, limits_of, mean_products, power_products, score, take_out
+from gyrostab.diagnose.products import (
+    WIDTHS,
+    Array,
+    Products,
+    evidence,
+    limits_of,
+    mean_products,
+    power_products,
+    score,
+    share_out,
+    take_out,
+)
 from gyrostab.errors import OptionError
 
 __all__ = ["Tier", "mean_factors", "mean_gains", "noise_columns", "power_factors", "power_gains", "score"]
@@ -180,9 +191,9 @@ def power_factors(
     Parameters
     ----------
     data : xarray.Dataset
-        Reduced data, one record or many with the same gaps: ``power`` ((record,) axis block band), ``shape`` (axis block band).
+        Reduced data, one record or many with the same gaps: ``power`` ((record,) axis block band).
     baseline : xarray.Dataset
-        ``spectrum``, and what `noise_columns` reads.
+        ``spectrum``, ``shape_alone``, ``common``, and what `noise_columns` reads.
     designs : sequence of ndarray, shape (block, band) or (block, band, column)
         Change of the spectrum as a share of it, for a unit of the factor.
     axis, tier, given, folds
@@ -195,7 +206,8 @@ def power_factors(
     """
     shape = (data.sizes["block"], data.sizes["band"])
     residual = _records((data["power"] / baseline["spectrum"] - 1.0).sel(axis=axis), "block", "band")
-    weight = np.array(data["shape"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64)
+    common = baseline["common"].sel(axis=axis).values
+    weight = np.array(baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64)
     weight[~np.isfinite(residual).all(axis=2) | ~np.isfinite(weight)] = 0.0
     residual[weight == 0.0] = 0.0
     columns, numbers = _columns(designs, shape)
@@ -203,6 +215,8 @@ def power_factors(
     beside, _ = _columns([level] if given is None else [level, np.asarray(given).reshape(*shape, -1)], shape)
     count = beside.shape[1]
     columns = np.concatenate([columns, beside], axis=1)
+    residual = share_out(residual, weight, common)
+    columns = share_out(columns.reshape(*shape, -1), weight, common).reshape(columns.shape)
     member, classes = _partition(fold_blocks(data) if folds is None else folds)
     parts = []
     for number in range(len(classes)):
@@ -210,7 +224,7 @@ def power_factors(
         cells = np.repeat(chosen, shape[1])
         parts.append(power_products(residual[chosen].reshape(int(cells.sum()), -1), weight[chosen].ravel(), columns[cells]))
     products = _subset_products(parts, classes)
-    before = np.diagonal(products[0].gram[0])
+    before: Array = np.asarray(np.diagonal(products[0].gram[0]))
     extra = limits_of(before, before)[columns.shape[1] - count + level.shape[2] :]
     more = np.diag(1.0 / np.square(np.where(extra > 0.0, extra, 1.0) * WIDTHS[-1]))
     full = np.zeros((count, count))

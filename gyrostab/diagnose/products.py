@@ -13,7 +13,7 @@ from gyrostab.kernels.evidence import mixed_evidence
 from gyrostab.kernels.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
 
-__all__ = ["WIDTHS", "Array", "Products", "evidence", "limits_of", "mean_products", "power_products", "score", "take_out"]
+__all__ = ["WIDTHS", "Array", "Products", "evidence", "limits_of", "mean_products", "power_products", "score", "share_out", "take_out"]
 
 Array = NDArray[np.float64]
 #: Standard deviations of the prior of a factor, in errors that it would have in white noise.
@@ -129,6 +129,39 @@ def power_products(residual: Array, weight: Array, columns: Array) -> Products:
     weighted = (columns * weight[:, None]).T
     square = weight @ (residual * residual)
     return Products(square[None], (weighted @ residual)[None], (weighted @ columns)[None], np.zeros(1))
+
+
+def share_out(values: Array, weight: Array, common: Array, unit: Array | None = None) -> Array:
+    """Take from the cells of each block so much of their common part that they are as good as independent.
+
+    Under random gaps the powers of all bands of a block rise and fall together: their covariance is ``1 / weight`` on the diagonal,
+    and ``common`` times the product of the units everywhere. Products of columns that went through here are those of that covariance.
+
+    Parameters
+    ----------
+    values : ndarray, shape (block, cell, column)
+        Data or designs.
+    weight : ndarray, shape (block, cell)
+        One over the variance that is not common; 0 where there are no data.
+    common : ndarray, shape (block,)
+        Variance of the common part.
+    unit : ndarray, shape (block, cell), optional
+        How strong it is in each cell, 1 by default.
+
+    Examples
+    --------
+    >>> weight, values = np.array([[4.0, 1.0]]), np.array([[[1.0], [3.0]]])
+    >>> free = share_out(values, weight, np.array([0.5]))
+    >>> float((weight[..., None] * free**2).sum().round(9))
+    6.0
+    >>> float((values[0].T @ np.linalg.inv([[0.75, 0.5], [0.5, 1.5]]) @ values[0])[0, 0].round(9))
+    6.0
+    """
+    one = np.ones_like(weight) if unit is None else unit
+    total = (weight * one**2).sum(axis=1)
+    taken = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(total > 0.0, total, 1.0)
+    part = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
+    return np.asarray(values - one[..., None] * part[:, None])
 
 
 def evidence(products: Products, designs: Sequence[NDArray[np.int64]], limits: Array, log_weight: Array) -> Array:
