@@ -20,6 +20,7 @@ _AT_ONCE = 1_000_000  # band powers of the null records that are scored at once
 _FIRST = 20  # null records that tell what a standard deviation is
 _POOL = 100.0  # null records that the mean over like windows counts for
 _SHARE = 0.25  # of the null records, the largest, to which the tail is fitted
+_STEEPEST = 0.7  # scale of the tail of half a squared normal score, at least: that of a single cell is 1
 _LEAST = 40
 _LEAST_P = 1e-9  # a tail from hundreds of records says nothing of rarer things
 
@@ -31,17 +32,18 @@ class Tail:
     sample: Array
     start: float
     scale: float
+    share: float
 
     def surprise(self, value: Array | float) -> Array:
         """``-log`` of the probability that the largest of a null record is `value` or more."""
         value = np.asarray(value, dtype=float)
         rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (self.sample.size + 1.0)
-        beyond = (value - self.start) / self.scale - np.log(_SHARE)
-        return np.asarray(np.where(value > self.start, beyond, -np.log(np.clip(rank, _SHARE, 1.0))))
+        beyond = (value - self.start) / self.scale - np.log(self.share)
+        return np.asarray(np.where(value > self.start, beyond, -np.log(np.clip(rank, self.share, 1.0))))
 
     def level(self, p: float) -> float:
         """Value that the largest of a null record reaches with probability `p`."""
-        return float(self.start + self.scale * np.log(_SHARE / p)) if p < _SHARE else float(np.quantile(self.sample, 1.0 - p))
+        return float(self.start + self.scale * np.log(self.share / p)) if p < self.share else float(np.quantile(self.sample, 1.0 - p))
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,9 @@ def standardise(scores: xr.Dataset, null: ViewNull) -> Array:
 def _tail(largest: Array) -> Tail:
     sample = np.sort(largest)
     start = float(np.quantile(sample, 1.0 - _SHARE))
-    return Tail(sample, start, max(float(np.mean(sample[sample > start] - start)) if sample[-1] > start else 0.0, 0.1))
+    above = sample[sample > start] - start
+    share = max(above.size, 1) / (sample.size + 1.0)
+    return Tail(sample, start, max(float(above.mean()) if above.size else 0.0, _STEEPEST), share)
 
 
 class _Gathered:

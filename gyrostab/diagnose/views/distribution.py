@@ -13,7 +13,7 @@ __all__ = ["COUNTS", "LENGTHS", "score"]
 LENGTHS = (1, 5, 15)
 #: What is counted.
 COUNTS = ("outliers", "repeats", "extremes", "zeros")
-_MOST = 4.0  # what the kurtosis of one block may say: a single outlier is for the counts to judge
+_MOST = 4.0  # that the kurtosis of one block may stand out: a single outlier is for the counts to judge
 #: Least scatter of the scores: where null records never count one, a single one is no mismatch. Two extremes every record has.
 _FLOOR = (0.35, 0.35, 0.7, 0.35, 0.2)
 
@@ -39,7 +39,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     counts = np.stack([np.nan_to_num(values_of(reduced, name, "axis", "block").astype(float)) for name in COUNTS], axis=-1)
     counts = over_windows(counts, windows)
     heavy, used = kurtosis_score(values_of(reduced, "kurtosis", "axis", "block"), samples)
-    heavy = np.clip(heavy, -_MOST, _MOST)
+    usual = np.median(heavy, axis=-1, keepdims=True)  # rounding has no tails, so that the noise itself may be away from 0
+    heavy = np.where(used > 0, usual + np.clip(heavy - usual, -_MOST, _MOST), 0.0)
     n = over_windows(used[..., None], windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         tails = np.where(n > 0, over_windows(heavy[..., None], windows) / np.sqrt(n), np.nan)
