@@ -1,0 +1,490 @@
+"""What every effect of the registry predicts for a reduced record, over its nuisance grid: the designs that naming compares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError
+from gyrostab.noise import HOUR, URAD_PER_S
+from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Prediction, Windows
+from gyrostab.physics.registry import effects
+
+__all__ = [
+    "VIEWS",
+    "Candidate",
+    "Variant",
+    "channel_units",
+    "effect_candidates",
+    "term_density",
+    "variants_of",
+    "windows_of",
+]
+
+Array = NDArray[Any]
+#: Where an effect can show, in the order in which they are looked at.
+VIEWS = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander")
+_MOST_VALUES, _MOST_VARIANTS = 60, 100
+_LEAST_SHARE = 0.5  # of the blocks in which a channel must have data
+_TWINS = {"fringe_hop": "bias_jump"}  # the same design: the size decides
+_SAME = 1e-3  # designs that differ by less of their size are one
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One point of the nuisance grid.
+
+    Attributes
+    ----------
+    values : mapping
+        Parameters that are not linear -> their values.
+    columns : tuple of str
+        Linear parameters, one for each column.
+    design : ndarray
+        By view. mean: (column, axis, block) [degree hour-1 per unit]; power: (column, axis, block, band), added density
+        [degree2 hour-2 Hz-1 per unit], of the squared parameter where `squared`; cross: the same for the product of the factors of two
+        axes; order: (1, axis, harmonic), complex; phase_locked: (column, phase); transfer: (column, band), complex; marks, line: empty;
+        wander: (column, block). The axis has the size 1 where all axes have the same.
+    squared : bool
+        The parameter enters by its square.
+    time : float
+        Of a random mean: the time constant of its memory [s], inf for a walk.
+    """
+
+    values: Mapping[str, Any]
+    columns: tuple[str, ...]
+    design: Array
+    squared: bool = False
+    time: float = np.inf
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect in one view.
+
+    Attributes
+    ----------
+    effect : str
+        Name in the registry; a generic begins with "~".
+    view : str
+        One of `VIEWS`.
+    driver : tuple of str
+        Channels of the log that it follows, in the order of the effect's channels; empty string for one that is not there.
+    variants : tuple of Variant
+        Over the nuisance grid.
+    marks : tuple of str
+        Statistics of the distribution that it raises, for the view "marks".
+    witness : tuple of str
+        Channel or axis of each column, for the view "transfer".
+    each : bool
+        Every axis has a size of its own; else one size holds for all.
+    """
+
+    effect: str
+    view: str
+    driver: tuple[str, ...]
+    variants: tuple[Variant, ...]
+    marks: tuple[str, ...] = ()
+    witness: tuple[str, ...] = ()
+    each: bool = True
+
+    @property
+    def key(self) -> str:
+        """Name with the channels, which tells two candidates of one effect apart."""
+        named = ",".join(filter(None, (*self.driver, *self.witness)))
+        return f"{self.effect}({named})" if named else self.effect
+
+
+def channel_units(reduced: xr.Dataset) -> dict[str, str]:
+    """Channel of the log -> its unit."""
+    begin = "channel_"
+    return {str(name)[len(begin) :]: str(reduced[name].attrs.get("units", "")) for name in reduced.data_vars if str(name).startswith(begin)}
+
+
+def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
+    """The reduced record as effects see it.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        From `reduce_log`.
+    drivers : mapping of str to str
+        Channel of the effect -> channel of the log.
+    """
+    axes = tuple(str(axis) for axis in reduced["axis"].values)
+    own = dict(zip(axes, map(_bridged, reduced["mean"].transpose("axis", "block").values), strict=True))
+
+    def spans(name: str) -> Array:
+        if f"{name}_begin" not in reduced:
+            return np.empty((0, 2))
+        return np.stack([reduced[f"{name}_begin"].values, reduced[f"{name}_end"].values], axis=1).astype(np.float64)
+
+    return Windows(
+        begin=reduced["begin"].values.astype(np.float64),
+        end=reduced["end"].values.astype(np.float64),
+        frequency=reduced["frequency"].values,
+        rate=float(reduced.attrs["sampling_rate_hz"]),
+        axes=axes,
+        drivers={inner: _bridged(reduced[f"channel_{name}"].values) for inner, name in drivers.items()},
+        own=own,
+        gaps=spans("gap"),
+        restarts=spans("restart"),
+        phase=(np.arange(reduced.sizes["phase"]) + 0.5) / reduced.sizes["phase"] if "profile" in reduced else np.empty(0),
+    )
+
+
+def _bridged(values: Array) -> Array:
+    """Values with the missing ones on straight lines between their neighbours."""
+    good = np.isfinite(values)
+    if good.all() or not good.any():
+        return np.asarray(values, np.float64)
+    place = np.arange(values.size)
+    return np.interp(place, place[good], values[good])
+
+
+def term_density(symbol: str, frequency: Array, rate: float) -> Array:
+    """Two-sided density of a noise term per squared coefficient [degree2 hour-2 Hz-1 per unit], as its samples have it."""
+    f = np.asarray(frequency, np.float64)
+    if symbol == "Q":
+        return np.asarray((2.0 * URAD_PER_S * np.sin(np.pi * f / rate)) ** 2 * rate)
+    if symbol == "N":
+        return np.full(f.shape, HOUR)
+    if symbol == "B":
+        return np.asarray(1.0 / (2.0 * np.pi * f))
+    if symbol == "K":
+        cycles = 2.0 * np.pi * f / rate
+        return np.asarray((2.0 + np.cos(cycles)) / (6.0 * (1.0 - np.cos(cycles))) / (HOUR * rate**2))
+    raise ValueError(f"no density for the term {symbol!r}")
+
+
+def effect_candidates(reduced: xr.Dataset, coefficient: xr.DataArray) -> tuple[list[Candidate], dict[str, str]]:
+    """All effects of the registry as far as this record can tell about them.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        From `reduce_log`.
+    coefficient : xarray.DataArray
+        ``(axis, term)``: noise of the baseline, in the units of the laws.
+
+    Returns
+    -------
+    candidates : list of Candidate
+    reasons : dict of str to str
+        Effect -> why it cannot be seen in this record.
+
+    Examples
+    --------
+    >>> from gyrostab.diagnose.reduced import reduce_log
+    >>> from gyrostab.log import make_log
+    >>> noise = 1.8 * np.random.default_rng(1).standard_normal((1, 60_000))
+    >>> reduced = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
+    >>> level = xr.DataArray([[0.003, 0.0]], {"axis": ["axis_0"], "term": ["N", "B"]}, ("axis", "term"))
+    >>> found, reasons = effect_candidates(reduced, level)
+    >>> reasons["shupe"]
+    'not identifiable: the recording has no channel temperature'
+    >>> sorted({one.effect for one in found if one.view == "marks"})
+    ['clipping', 'dead_zone', 'held_samples', 'rate_quantization', 'spikes']
+    """
+    units = channel_units(reduced)
+    found: list[Candidate] = []
+    reasons: dict[str, str] = {}
+    for name, kind in effects().items():
+        if name in _TWINS:
+            continue
+        made: list[Candidate] = []
+        said = ""
+        for drivers in _drivers(kind, reduced, units):
+            more, why = _of_kind(kind, reduced, drivers, coefficient)
+            made += more
+            said = said or why
+        found += made
+        if not made:
+            reasons[name] = f"not identifiable: {said or 'it leaves no trace in means, spectra and distribution of this record'}"
+    return found, reasons
+
+
+# ------------------------------------------------------------------------------------------------------------- channels
+
+
+def _drivers(kind: type[Effect], reduced: xr.Dataset, units: Mapping[str, str]) -> Iterator[dict[str, str]]:
+    """Channels of the effect -> channels of the log, in every way that makes sense."""
+    options = [_matches(channel, unit, tuple(kind.channels), reduced, units) or [""] for channel, unit in kind.channels.items()]
+    seen = set()
+    for chosen in product(*options):
+        named = [name for name in chosen if name]
+        if len(set(named)) < len(named) or frozenset(named) in seen:
+            continue
+        seen.add(frozenset(named))
+        yield {channel: name for channel, name in zip(kind.channels, chosen, strict=True) if name}
+    if not seen:
+        yield {}
+
+
+def _matches(channel: str, unit: str, channels: tuple[str, ...], reduced: xr.Dataset, units: Mapping[str, str]) -> list[str]:
+    """Channels of the log that can stand for one of the effect's: vectors by their name, others by the beginning of it."""
+    if sum(other[:-1] == channel[:-1] for other in channels) > 1 and channel[-1] in "xyz":
+        names = [channel]
+    else:
+        base = channel.rstrip("0123456789").rstrip("_")
+        names = sorted((name for name in units if name == base or name.startswith(base + "_")), key=lambda name: (name != channel, name))
+    return [name for name in names if units.get(name) == unit and np.isfinite(reduced[f"channel_{name}"].values).mean() >= _LEAST_SHARE]
+
+
+# -------------------------------------------------------------------------------------------------------------- variants
+
+
+def _of_kind(kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray) -> tuple[list[Candidate], str]:
+    """Candidates of one effect with its channels, by view; and why there are none."""
+    if kind.channels and not drivers:
+        return [], f"the recording has no channel {' or '.join(kind.channels)}"
+    windows = windows_of(reduced, drivers)
+    predictions: list[tuple[dict[str, Any], Prediction]] = []
+    why = ""
+    for values in _grid(kind, windows):
+        try:
+            effect = kind.example(**values)
+            predictions.append((values, _exogenous(effect, windows)))
+        except KeyError as error:
+            why = f"the recording has no channel {error.args[0]}"
+        except OptionError as error:
+            why = str(error)
+    driver = tuple(drivers.get(channel, "") for channel in kind.channels) if drivers else ()
+    still = [name for name in drivers.values() if np.ptp(windows.drivers[_inner(drivers, name)]) == 0.0]
+    if still:
+        why = f"{' and '.join(still)} {'does' if len(still) == 1 else 'do'} not change"
+    many = {item.name for item in kind.parameters() if item.many}
+    made = []
+    for view, build in _BUILDERS.items():
+        variants = _distinct([one for values, seen in predictions for one in build(values, seen, reduced, coefficient)])
+        if not variants:
+            continue
+        marks = tuple(dict.fromkeys(mark for _, seen in predictions for mark in seen.marks)) if view == "marks" else ()
+        each = view != "order" or bool(many & set(variants[0].columns))
+        made.append(Candidate(kind.name, view, driver, variants, marks=marks, each=each))
+    made += [replace(one, driver=driver) for one in _transfers(kind.name, predictions, windows, reduced)]
+    return made, why
+
+
+def variants_of(candidate: Candidate, variant: Variant, reduced: xr.Dataset, coefficient: xr.DataArray) -> Variant | None:
+    """A variant of a candidate made anew, for other channels or other values of the same parameters; None where it is nothing."""
+    kind = effects()[candidate.effect]
+    drivers = {inner: name for inner, name in zip(kind.channels, candidate.driver, strict=False) if name}
+    seen = _exogenous(kind.example(**variant.values), windows_of(reduced, drivers))
+    made = _BUILDERS[candidate.view](dict(variant.values), seen, reduced, coefficient)
+    return next((one for one in made if one.columns == variant.columns and one.squared == variant.squared), None)
+
+
+def _inner(drivers: Mapping[str, str], name: str) -> str:
+    return next(inner for inner, outer in drivers.items() if outer == name)
+
+
+def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
+    """Values of the nuisance parameters, and of the words."""
+    try:
+        grid: dict[str, Sequence[Any]] = {name: _thinned(values) for name, values in kind.example().nuisance(windows).items()}
+    except KeyError:
+        grid = {}
+    grid |= {item.name: item.choices for item in kind.parameters() if item.choices}
+    points = list(product(*grid.values()))
+    for point in points[:: max(1, -(-len(points) // _MOST_VARIANTS))]:
+        yield {name: value if isinstance(value, str) else float(value) for name, value in zip(grid, point, strict=True)}
+
+
+def _thinned(values: Array) -> list[Any]:
+    every = max(1, -(-len(values) // _MOST_VALUES))
+    return list(values[every // 2 :: every])
+
+
+def _exogenous(effect: Effect, windows: Windows) -> Prediction:
+    """What an effect predicts, without the means of an axis that come from the axis's own noisy reading."""
+    whole = effect.explain(windows)
+    if not whole.mean:
+        return whole
+    shape = (len(windows.axes), windows.begin.size)
+    mean = {name: np.array(np.broadcast_to(np.atleast_2d(values), shape)) for name, values in whole.mean.items()}
+    nothing = np.full(windows.begin.size, np.nan)
+    without_any = effect.explain(replace(windows, own=dict.fromkeys(windows.axes, nothing))).mean
+    for name, values in mean.items():
+        if name in without_any and np.isfinite(without_any[name]).all():
+            continue
+        for row, axis in enumerate(windows.axes):
+            blind = replace(windows, own=dict(windows.own) | {axis: nothing})
+            seen = np.broadcast_to(np.atleast_2d(effect.explain(blind).mean[name]), shape)[row]
+            if not np.array_equal(seen, values[row]):
+                values[row] = 0.0
+    return replace(whole, mean=mean)
+
+
+def _distinct(variants: list[Variant]) -> tuple[Variant, ...]:
+    """Variants without those whose designs another one has already, or are empty of anything."""
+    kept: list[Variant] = []
+    seen: set[tuple[Any, ...]] = set()
+    for one in variants:
+        if one.design.size:
+            size = np.abs(one.design).max(initial=0.0)
+            if not (np.isfinite(size) and size > 0.0):
+                continue
+            mark: tuple[Any, ...] = (one.columns, one.time, np.round(one.design / size / _SAME).tobytes())
+        else:
+            mark = (one.columns,)
+        if mark not in seen:
+            seen.add(mark)
+            kept.append(one)
+    return tuple(kept)
+
+
+def _choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
+    """Each parameter by itself, and all together."""
+    alone = [(name,) for name in columns]
+    return alone if len(alone) < 2 else [*alone, tuple(columns)]
+
+
+# ------------------------------------------------------------------------------------------------------------------ views
+
+
+def _means(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    """Designs of the mean, each less its mean over time: the constant is free."""
+    columns = {}
+    for name, design in seen.mean.items():
+        moved = design - design.mean(axis=-1, keepdims=True)
+        if np.isfinite(moved).all() and np.abs(moved).max() > 1e-9 * np.abs(design).max(initial=1e-300):
+            columns[name] = design
+    for chosen in _choices(list(columns)):
+        yield Variant(values, chosen, np.stack([columns[name] for name in chosen]))
+
+
+def _powers(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    """Added densities; a filter as what it adds or takes at its full size. What is constant and coherent is for the cross-spectra."""
+    frequency, rate = reduced["frequency"].values, float(reduced.attrs["sampling_rate_hz"])
+    level: dict[str, Array] = {}
+    for (symbol, name), share in seen.level.items():
+        square = coefficient.sel(term=symbol).values ** 2 if symbol in coefficient["term"].values else np.zeros(coefficient.sizes["axis"])
+        part = np.atleast_2d(share)[..., None] * square[:, None, None] * term_density(symbol, frequency, rate)
+        level[name] = level.get(name, 0.0) + part
+    spectrum = {}
+    if seen.line is None:
+        spectrum = {name: _rows(density) for name, density in seen.spectrum.items() if _moves(density) or not seen.coherent}
+    for columns, squared in ((level, False), (spectrum, True)):
+        kept = {name: density for name, density in columns.items() if np.abs(density).max(initial=0.0) > 0 and not _flat(density)}
+        for chosen in _choices(list(kept)):
+            yield Variant(values, chosen, np.stack([kept[name] for name in chosen]), squared=squared)
+    if seen.response is not None:
+        yield Variant(values, (), _filtered(seen.response, coefficient, frequency, rate)[None])
+
+
+def _filtered(response: Array, coefficient: xr.DataArray, frequency: Array, rate: float) -> Array:
+    total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
+    for symbol in "QNBK":
+        if symbol in coefficient["term"].values:
+            total += coefficient.sel(term=symbol).values[:, None, None] ** 2 * term_density(symbol, frequency, rate)
+    return total * (response - 1.0)
+
+
+def _rows(density: Array) -> Array:
+    """A density with the axis in front."""
+    return np.asarray(density if np.ndim(density) == 3 else np.asarray(density)[None])
+
+
+def _moves(density: Array) -> bool:
+    """A density changes over the windows."""
+    rows = _rows(density)
+    return bool(np.abs(rows - rows[:, :1]).max(initial=0.0) > 1e-6 * np.abs(rows).max(initial=0.0))
+
+
+def _flat(density: Array) -> bool:
+    """A density is white and constant in time: a change of N, which is free."""
+    return bool(np.ptp(_rows(density)) <= 1e-6 * np.abs(density).max(initial=0.0))
+
+
+def _crosses(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    """Cross-densities per product of the factors of both axes."""
+    if not seen.coherent or seen.line is not None or "cross" not in reduced:
+        return
+    for name, density in seen.spectrum.items():
+        yield Variant(values, (name,), _rows(density)[None], squared=True)
+
+
+def _orders(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    if "order" not in reduced:
+        return
+    count = reduced.sizes["harmonic"]
+    for name, pattern in seen.order.items():
+        yield Variant(values, (name,), pattern[None, :, :count])
+
+
+def _profiles(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    if "profile" not in reduced:
+        return
+    kept = {name: design for name, design in seen.phase_locked.items() if np.isfinite(design).all() and np.ptp(design) > 0}
+    for chosen in _choices(list(kept)):
+        yield Variant(values, chosen, np.stack([kept[name] for name in chosen]))
+
+
+def _marks(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    if seen.marks:
+        yield Variant(values, seen.marks, np.empty(0))
+
+
+def _lines(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    """A line that does not move, wherever it is; its frequency is found in the spectrum itself."""
+    if seen.line is None or "line_power" not in reduced or not seen.coherent or np.ptp(seen.line) > 0:
+        return
+    yield Variant({}, tuple(seen.spectrum), np.empty(0), squared=True)
+
+
+def _wanders(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    block = float(reduced.attrs["block_s"])
+    for name, (time, variance) in seen.wander.items():
+        if time >= block / 2.0:
+            yield Variant(values, (name,), np.asarray(variance)[None], squared=True, time=time)
+
+
+_BUILDERS = {
+    "marks": _marks,
+    "mean": _means,
+    "power": _powers,
+    "cross": _crosses,
+    "order": _orders,
+    "phase_locked": _profiles,
+    "line": _lines,
+    "wander": _wanders,
+}
+
+
+def _transfers(name: str, predictions: list[tuple[dict[str, Any], Prediction]], windows: Windows, reduced: xr.Dataset) -> list[Candidate]:
+    """Rates that follow another channel, or another axis, at every frequency."""
+    there = {str(one) for one in reduced["witness"].values} if "witness" in reduced.dims else set()
+    axes = set(windows.axes) if "cross" in reduced else set()
+    found: dict[str, list[Variant]] = {}
+    for values, seen in predictions:
+        for (parameter, channel), transfer in seen.transfer.items():
+            if channel in there or channel in axes:
+                found.setdefault(channel, []).append(Variant(values, (parameter,), np.asarray(transfer)[None]))
+    if found and effects()[name].stage == "motion":
+        strange = [channel for channel in sorted(there) if not _known(channel)]
+        for channel in [*found, *strange]:
+            found[channel] = found.get(channel, []) + _any_transfer(windows.frequency.size)
+    return [Candidate(name, "transfer", (), _distinct(variants), witness=(channel,)) for channel, variants in found.items()]
+
+
+def _known(channel: str) -> bool:
+    """A channel drives some effect of the registry, or is known to be no motion."""
+    bases = {name for kind in effects().values() for name in kind.channels}
+    return (
+        any(channel == name or channel.startswith(name.rstrip("0123456789").rstrip("_") + "_") for name in bases) or channel == "pressure"
+    )
+
+
+def _any_transfer(bands: int) -> list[Variant]:
+    """Any factor in a band, and in every band: a mounting may resonate."""
+    alone = np.eye(bands, dtype=np.complex128)
+    one = [Variant({}, ("any",) * 2, np.stack([row, 1j * row])) for row in alone]
+    return [*one, Variant({}, ("any",) * (2 * bands), np.concatenate([alone, 1j * alone]))]

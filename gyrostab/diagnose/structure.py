@@ -1,0 +1,59 @@
+"""What the data cannot tell by their nature, and sizes that physics does not allow."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from gyrostab.diagnose.cells import State
+from gyrostab.diagnose.explained import Part
+
+__all__ = ["STRUCTURAL", "allowed", "structural"]
+
+#: Effect -> effects that look the same in block statistics, whatever the excitation.
+STRUCTURAL: dict[str, tuple[str, ...]] = {
+    "gauss_markov": ("telegraph",),
+    "telegraph": ("gauss_markov",),
+    "spectral_line": ("real_motion", "supply_bias"),
+}
+#: Effect -> largest size that is plausible, by parameter.
+_LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
+_SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
+_MOVING = 1.5  # times the expected power, from which on an axis moves
+_LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
+
+
+def allowed(effect: str, parts: Sequence[Part], state: State) -> bool:
+    """Whether the sizes that fit are possible for the effect."""
+    from gyrostab.diagnose.sizes import part_size
+
+    for part in parts:
+        if effect == "misalignment" and part.candidate.view == "transfer" and not _moves(part.candidate.witness[0], state):
+            return False
+        if effect == "fringe_hop" and abs(part_size(part, state)[0]) * np.abs(part.variant.design).max() < _SMALLEST_FRINGE:
+            return False
+        if effect in _LARGEST and part.variant.columns[0] != "any" and abs(part_size(part, state)[0]) > _LARGEST[effect]:
+            return False
+        if part.variant.squared and part.candidate.view == "power" and part_size(part, state)[0] <= 0.0:
+            return False
+    return True
+
+
+def _moves(axis: str, state: State) -> bool:
+    """Whether an axis shows more than its noise at some frequency: what is at rest cannot leak in."""
+    row = state.axes.index(axis)
+    expected = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
+    return bool(np.nanmax(np.nanmean(state.reduced["power"].values[row] / expected, axis=0)) > _MOVING)
+
+
+def structural(effect: str, parts: Sequence[Part], state: State, tried: Collection[str]) -> list[str]:
+    """Effects that are part of the answer by their nature."""
+    out = list(STRUCTURAL.get(effect, ()))
+    reduced = state.reduced
+    if effect == "vibration_rectification":
+        vibration = reduced[f"channel_{parts[0].candidate.driver[0]}"].values
+        good = np.isfinite(vibration)
+        if np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1] > _LEVELS:
+            out.append("g_sensitivity")
+    return out

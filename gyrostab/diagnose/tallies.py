@@ -1,0 +1,136 @@
+"""Counts of odd samples and lines in the spectrum: gains of what is not linear in a few designs."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.folds import FOLDS
+
+__all__ = ["COUNTS", "Expected", "count_gains", "expected_counts", "kurtosis_gains", "line_gains", "local_level"]
+
+Array = NDArray[Any]
+#: Counts of blocks that effects raise.
+COUNTS = ("outliers", "repeats", "extremes", "zeros")
+_SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
+_NEIGHBOURS = 25  # lines on each side that tell the level
+
+
+class Expected:
+    """Mean and overdispersion of the counts of null records, by axis, gathered chunk by chunk."""
+
+    def __init__(self) -> None:
+        self.sums: dict[str, list[Array]] = {name: [] for name in (*COUNTS, "kurtosis")}
+
+    def add(self, nulls: xr.Dataset) -> None:
+        """Take in some null records."""
+        for name in self.sums:
+            if name in nulls:
+                self.sums[name].append(nulls[name].transpose("record", "axis", "block").values.astype(np.float64))
+
+    def blocks(self, name: str) -> Array:
+        """(record, axis, block)."""
+        return np.concatenate(self.sums[name])
+
+
+def expected_counts(values: Array) -> tuple[Array, Array]:
+    """Mean of a block's count and overdispersion of the record's, both (axis,), from null records (record, axis, block)."""
+    total = values.sum(axis=2)
+    mean = np.maximum(total.mean(axis=0), 1.0 / len(total))
+    spread = np.maximum(total.var(axis=0) / mean, 1.0)
+    return mean / values.shape[2], spread
+
+
+def _log_ratio(count: Array, mean: Array) -> Array:
+    """Log Bayes factor of a count that is raised by an unknown factor, over one that is not."""
+    from scipy.special import gammaln
+
+    a, b = _SHAPE, _RATE
+    raised = gammaln(count + a) - gammaln(a) + a * np.log(b) - (count + a) * np.log(b + mean) + count * np.log(mean)
+    even = -mean + count * np.log(mean)
+    return np.where(count > mean, raised - even, np.minimum(raised - even, 0.0))
+
+
+def _held_out(evidence: Array, lengths: int) -> Array:
+    """Largest over the lengths of the sum over folds, from (subset, ...)."""
+    parts = evidence[1:].reshape(lengths, FOLDS, *evidence.shape[1:])
+    return np.asarray((evidence[0] - parts).sum(axis=1).max(axis=0))
+
+
+def count_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
+    """Held-out gain of a raised count.
+
+    Parameters
+    ----------
+    values : ndarray, shape (record, axis, block)
+    mean, spread : ndarray, shape (axis,)
+        From `expected_counts`.
+    subsets : ndarray of bool, shape (subset, block)
+        From `fold_subsets`.
+
+    Returns
+    -------
+    ndarray, shape (record, axis)
+    """
+    found = []
+    for subset in subsets:
+        count = values[:, :, subset].sum(axis=2) / spread
+        found.append(_log_ratio(count, mean * subset.sum() / spread))
+    return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
+
+
+def kurtosis_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
+    """Held-out gain of a higher kurtosis; `mean` and `spread` are those of a block, (axis,); the rest as in `count_gains`."""
+    z = np.clip(np.where(np.isfinite(values), (values - mean[:, None]) / spread[:, None], 0.0), -8.0, 8.0)
+    found = []
+    for subset in subsets:
+        total = z[:, :, subset].sum(axis=2) / np.sqrt(subset.sum())
+        size = 100.0  # prior variance, of the total of the whole record
+        part = size * subset.mean()
+        found.append(0.5 * total**2 * part / (1.0 + part) * (total > 0) - 0.5 * np.log1p(part))
+    return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
+
+
+def line_gains(power: Array, weight: Array) -> Array:
+    """Gain of a steady line on the parts of the record that were held out, less the logarithm of the number of lines.
+
+    Parameters
+    ----------
+    power : ndarray, shape (record, axis, part, line)
+        Mean periodograms.
+    weight : ndarray, shape (axis, part)
+        Independent periodograms in each mean.
+
+    Returns
+    -------
+    ndarray, shape (record, axis, line)
+    """
+    usable = (weight > 0) & np.isfinite(power).all(axis=(0, 3))
+    share = np.where(usable, weight, 0.0)[..., None]
+    clean = np.where(usable[..., None], power, 0.0)
+    total = (clean * share).sum(axis=2) / np.maximum(share.sum(axis=1), 1e-9)
+    level = local_level(total)[:, :, None]
+    ratio = clean / level
+    gain = np.zeros(total.shape)
+    for number in range(FOLDS):
+        held = np.arange(power.shape[2]) % FOLDS == number
+        train = np.maximum(share[:, ~held].sum(axis=1), 1e-9)
+        excess = np.maximum((ratio[:, :, ~held] * share[:, ~held]).sum(axis=2) / train - 1.0, 0.0)[:, :, None]
+        gain += (share[:, held] * (ratio[:, :, held] * excess / (1.0 + excess) - np.log1p(excess))).sum(axis=2)
+    return gain - np.log(power.shape[3])
+
+
+def local_level(total: Array) -> Array:
+    """Medians over stretches of lines, and straight lines between their middles."""
+    count = total.shape[-1]
+    ends = np.linspace(0, count, max(1, count // (2 * _NEIGHBOURS)) + 1).astype(int)
+    medians = np.stack([np.median(total[..., low:high], axis=-1) for low, high in pairwise(ends)], axis=-1)
+    middle = (ends[1:] + ends[:-1] - 1) / 2.0
+    place = np.clip(np.interp(np.arange(count), middle, np.arange(middle.size)), 0.0, middle.size - 1.0)
+    low = np.minimum(place.astype(int), max(middle.size - 2, 0))
+    high = np.minimum(low + 1, middle.size - 1)
+    return np.asarray(medians[..., low] + (place - low) * (medians[..., high] - medians[..., low]))
