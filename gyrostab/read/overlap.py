@@ -74,7 +74,7 @@ def _with_note(part: xr.Dataset, note: str) -> xr.Dataset:
 
 
 def _stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
-    return np.asarray(part["time"][max(begin, 0) : end].values).astype("datetime64[ns]").view(np.int64)
+    return np.asarray(part["time"][max(begin, 0) : end].values).astype("datetime64[ns]", copy=False).view(np.int64)
 
 
 def stamp_span(part: xr.Dataset) -> tuple[int, int]:
@@ -82,10 +82,9 @@ def stamp_span(part: xr.Dataset) -> tuple[int, int]:
     first, latest = None, NAT
     for begin in range(0, part.sizes["row"], _BLOCK):
         stamps = _stamps(part, begin, begin + _BLOCK)
-        good = stamps[stamps != NAT]
-        if len(good):
-            first = int(good[0]) if first is None else first
-            latest = max(latest, int(good.max()))
+        latest = max(latest, int(stamps.max()))  # NAT is the least integer
+        if first is None and latest != NAT:
+            first = int(stamps[np.argmax(stamps != NAT)])
     return (first if first is not None else int(np.iinfo(np.int64).max)), latest
 
 
