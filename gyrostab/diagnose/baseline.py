@@ -7,90 +7,31 @@ is kept as draws, so that null records carry the error of the calibration.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import pairwise
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.expected import NOISE, common_variance, noise_powers, white_variance
 from gyrostab.diagnose.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
 from gyrostab.diagnose.products import mean_products
 from gyrostab.diagnose.quiet import loudness, quiet_blocks, quiet_spans
-from gyrostab.errors import SchemaError
-from gyrostab.kernels.expected import expected_powers
-from gyrostab.kernels.periodogram import band_edges, ordinates, taper
-from gyrostab.noise import HOUR, LAWS, TERMS, URAD_PER_S
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.noise import HOUR, LAWS, TERMS
+from gyrostab.physics.base import Effect, driver_error
+from gyrostab.simulate.model import Model, read_model
 
-__all__ = ["NOISE", "assemble", "calibrate", "common_variance", "grid_values", "line_columns", "noise_powers", "white_variance"]
+__all__ = ["assemble", "calibrate", "from_model", "from_simulation", "grid_values", "known_effects"]
 
 Array = NDArray[np.float64]
-#: Random terms, in the order of the dimension `noise`.
-NOISE = ("Q", "N", "B", "K")
 _DRAWS = 512
 #: Values of K and B that the noise may have instead, as multiples of the calibrated ones.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
 _LOW_SHAPE = 20.0  # of the lowest bands, which say how noisy the mean of a block is
 _EXCESS = 4.0  # standard deviations from which on a block is noisier
 _POWER = "degree2 hour-2 Hz-1"
-
-
-def line_columns(reduced: xr.Dataset) -> Array:
-    """Expected power of every ordinate of a full block for unit squares of Q, N, B, K.
-
-    Returns
-    -------
-    ndarray, shape (line, term)
-        [degree2 hour-2 Hz-1 per squared unit of the noise table].
-    """
-    size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
-    return np.asarray(expected_powers(taper(size), rate, ordinates(size)).T * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR]))
-
-
-def noise_powers(reduced: xr.Dataset) -> Array:
-    """Expected band powers for unit squares of Q, N, B, K, as the gaps of each block let them be seen.
-
-    Returns
-    -------
-    ndarray, shape (axis, block, band, term)
-        [degree2 hour-2 Hz-1 per squared unit of the noise table].
-    """
-    each = line_columns(reduced).T
-    edges = band_edges(int(reduced.attrs["block_samples"])) - 1
-    whole = np.stack([each[:, low:high].mean(axis=1) for low, high in pairwise(edges)])
-    near = reduced["neighbours"].transpose("axis", "block").values
-    near = np.where(np.isfinite(near), near, 1.0)[..., None, None]
-    return np.asarray(near * whole + (1.0 - near) * each.mean(axis=1))
-
-
-def common_variance(reduced: xr.Dataset) -> tuple[Array, Array]:
-    """Relative variance that all band powers of a block have in common through random gaps, and the shape of what is left.
-
-    Returns
-    -------
-    common : ndarray, shape (axis, block)
-    shape : ndarray, shape (axis, block, band)
-        Of the gamma distribution of each power when the common factor is known.
-    """
-    shape = reduced["shape"].transpose("axis", "block", "band").values
-    near = reduced["neighbours"].transpose("axis", "block").values
-    samples = np.maximum(reduced["samples"].transpose("axis", "block").values, 1)
-    scattered = np.clip(1.0 - np.where(np.isfinite(near), near, 1.0), 0.0, 1.0)
-    weights = taper(int(reduced.attrs["block_samples"]))
-    scattered = np.maximum(scattered - (1.0 - float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())), 0.0)
-    common = 2.0 * scattered / samples
-    common = np.minimum(common, 0.8 / np.where(np.isfinite(shape), shape, 0.0).max(axis=2, initial=1e-9))
-    return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
-
-
-def white_variance(reduced: xr.Dataset, square: Array) -> Array:
-    """Variance of block means by Q and N, shape (axis, block) [degree2 hour-2], for squares of shape (axis, 4)."""
-    samples = reduced["samples"].transpose("axis", "block").values.astype(np.float64)
-    near = reduced["neighbours"].transpose("axis", "block").values
-    rate, count = float(reduced.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
-    apart = 1.0 - np.where(np.isfinite(near), near, samples / float(reduced.attrs["block_samples"]))
-    runs = np.maximum(apart, 0.0) * count + 1.0  # each leaves a rounding of the angle at either end
-    return np.asarray(HOUR * rate * square[:, 1:2] / count + 2.0 * URAD_PER_S**2 * rate**2 * square[:, :1] * runs / count**2)
 
 
 def _noisier(power: Array, shape: Array, spectrum: Array) -> Array:
@@ -162,6 +103,12 @@ def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     (True, 'calibrated')
     """
     chosen, reason = quiet_blocks(reduced, quiet)
+    attrs = {"source": "calibrated", "calibrated_on": quiet_spans(reduced, chosen), "quiet_by": reason}
+    return assemble(reduced, _posteriors(reduced, chosen), quiet=chosen, attrs=attrs)
+
+
+def _posteriors(reduced: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior]:
+    """Noise of every axis from the chosen blocks (axis, block)."""
     columns = noise_powers(reduced)
     common, rest = common_variance(reduced)
     power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
@@ -169,18 +116,19 @@ def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     step = float(reduced.attrs["block_s"])
     found = []
     for row, axis in enumerate(reduced["axis"].values):
-        fit = summed(power[row][chosen[row]], shape[row][chosen[row]], columns[row][chosen[row]])
+        use = chosen[row]
+        fit = summed(power[row][use], shape[row][use], columns[row][use])
         if fit.power.size < 4:
             raise SchemaError(
                 f"axis {axis}: the quiet blocks hold spectra in {fit.power.size} bands, too few to calibrate on; "
                 "name other quiet time, or diagnose a part of the record with fewer gaps"
             )
-        fit = _with_common(fit, shape[row][chosen[row]], rest[row][chosen[row]], common[row][chosen[row]])
-        first = white_variance(reduced, np.tile(np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0]), (len(mean), 1)))[row]
-        present = chosen[row] & np.isfinite(mean[row])
-        found.append(noise_posterior(fit, mean[row], first, present, step=step, draws=_DRAWS, rng=np.random.default_rng(row)))
-    attrs = {"source": "calibrated", "calibrated_on": quiet_spans(reduced, chosen), "quiet_by": reason}
-    return assemble(reduced, found, columns, quiet=chosen, attrs=attrs)
+        fit = _with_common(fit, shape[row][use], rest[row][use], common[row][use])
+        square = np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0])
+        variance = white_variance(reduced, np.tile(square, (len(mean), 1)))[row]
+        present = use & np.isfinite(mean[row])
+        found.append(noise_posterior(fit, mean[row], variance, present, step=step, draws=_DRAWS, rng=np.random.default_rng(row)))
+    return found
 
 
 def _with_common(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
@@ -193,7 +141,6 @@ def _with_common(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
 def assemble(
     reduced: xr.Dataset,
     found: list[Posterior],
-    columns: Array,
     *,
     quiet: NDArray[np.bool_],
     attrs: Mapping[str, Any],
@@ -207,8 +154,6 @@ def assemble(
     reduced : xarray.Dataset
     found : list of Posterior
         One for each axis.
-    columns : ndarray, shape (axis, block, band, term)
-        From `noise_powers`.
     quiet : ndarray of bool, shape (axis, block)
     attrs : mapping
         ``source``, ``calibrated_on`` and what else there is to say.
@@ -217,11 +162,14 @@ def assemble(
     spectrum : ndarray, shape (axis, block, band), optional
         Expected power with effects; that of the noise without it.
     """
+    columns = noise_powers(reduced)
     square = np.stack([one.square for one in found])
-    expected = np.einsum("abfn,an->abf", columns, square) if spectrum is None else spectrum
+    noise = np.einsum("abfn,an->abf", columns, square)
+    expected = noise if spectrum is None else spectrum
     power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
     floor = np.array([1e-3 * one.min() / HOUR for one in expected])
     white = white_variance(reduced, np.stack([square[:, 0], np.maximum(square[:, 1], floor), square[:, 2], square[:, 3]], axis=1))
+    white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
     variance = white * np.stack([_noisier(*parts) for parts in zip(power, shape, expected, strict=True)])
     span = reduced.sizes["block"] * float(reduced.attrs["block_s"])
     grids = [_grid(one, max(one.square[1], least) * HOUR, span) for one, least in zip(found, floor, strict=True)]
@@ -281,3 +229,130 @@ def _ramp_error(reduced: xr.Dataset, white: Array, value: Array, quiet: NDArray[
         seen = mean_products(hours[:, :0], hours, variance=white[row], step=step, K=K, B=B, present=present[row]).gram[0, 0, 0]
         error[row] = 1.0 / np.sqrt(seen) if seen > 0.0 else np.inf
     return error
+
+
+def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
+    """Baseline of a model that is taken as it is: its noise, and its effects as far as means and band powers show them.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        The recording, from `reduce_log`.
+    model : path, mapping or Model
+        As `gyrostab.simulate` takes it.
+
+    Returns
+    -------
+    xarray.Dataset
+        As `calibrate` has it; the noise has no error. ``attrs["left_out"]`` names the effects that show elsewhere too (in
+        distributions, transfers, orders of the rotation, random wander): that part of them is not in it.
+
+    Raises
+    ------
+    OptionError, FormatError
+        When the model makes no sense, or has no noise.
+    SchemaError
+        When the recording lacks the channel of an effect.
+    """
+    made = model if isinstance(model, Model) else read_model(model)
+    axes = [str(axis) for axis in reduced["axis"].values]
+    found = []
+    for axis in axes:
+        coefficients = made.coefficients(axis)
+        square = np.array([coefficients[term] ** 2 for term in NOISE])
+        if not square.any():
+            raise OptionError(f"{made.source}: axis {axis} has no noise to compare a recording with; give N in [noise] or [noise.{axis}]")
+        draws = np.tile(square, (_DRAWS, 1))
+        K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
+        found.append(Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True))
+    mean, spectrum, left_out = known_effects(reduced, made, np.stack([one.square for one in found]))
+    hours = (reduced["begin"].values + reduced["end"].values) / (2.0 * HOUR)
+    ramp = np.array([made.coefficients(axis)["R"] for axis in axes])
+    attrs = {"source": "model", "calibrated_on": [], "model": made.source, "left_out": left_out}
+    quiet = np.ones((len(axes), reduced.sizes["block"]), np.bool_)
+    out = assemble(reduced, found, quiet=quiet, attrs=attrs, known_mean=mean + ramp[:, None] * hours, spectrum=spectrum)
+    out["coefficient"].loc[{"term": "R"}] = ramp
+    out["stderr"][:] = 0.0
+    return out
+
+
+def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset) -> xr.Dataset:
+    """Baseline of a simulated log: its noise with the error of calibrating it, and its level over time where that changes.
+
+    What a simulation does to the means over time cannot be told from its random walk, so it is not taken as known; `from_model` takes it.
+
+    Parameters
+    ----------
+    reduced, simulated : xarray.Dataset
+        Recording and simulation, from `reduce_log`.
+
+    Raises
+    ------
+    SchemaError
+        When the two differ in axes, sampling rate or length.
+    """
+    for name, wanted, got in (
+        ("sampling rate [Hz]", reduced.attrs["sampling_rate_hz"], simulated.attrs["sampling_rate_hz"]),
+        ("blocks", (reduced.sizes["block"], reduced.attrs["block_samples"]), (simulated.sizes["block"], simulated.attrs["block_samples"])),
+        ("axes", list(reduced["axis"].values), list(simulated["axis"].values)),
+    ):
+        if wanted != got:
+            raise SchemaError(f"simulation: {name} {got}, but {wanted} in the recording; simulate with --like RECORDING")
+    chosen, reason = quiet_blocks(simulated)
+    found = _posteriors(simulated, chosen)
+    plain = np.einsum("abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in found]))
+    power, shape = (simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape"))
+    level = np.ones(plain.shape[:2])
+    for row in range(len(plain)):
+        risen, deviation = loudness(power[row] / plain[row] - 1.0, shape[row])
+        level[row] = np.where(deviation > _EXCESS, risen, 1.0)
+    spectrum = np.einsum("abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found])) * level[..., None]
+    attrs = {"source": "simulation", "calibrated_on": quiet_spans(simulated, chosen), "quiet_by": reason}
+    return assemble(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum)
+
+
+def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> tuple[Array, Array, list[str]]:
+    """What the effects of a model make of the record: means (axis, block), band powers (axis, block, band), and the effects left out.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+    model : Model
+    square : ndarray, shape (axis, 4)
+        Squared noise coefficients.
+    """
+    from gyrostab.diagnose.candidates import windows_of
+
+    axes = [str(axis) for axis in reduced["axis"].values]
+    columns = noise_powers(reduced)
+    mean, level = np.zeros(columns.shape[:2]), np.repeat(square[:, None], columns.shape[1], axis=1)
+    added, response, left_out = np.zeros(columns.shape[:3]), np.ones((len(axes), 1, columns.shape[2])), []
+    for effect in model.effects:
+        rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
+        drivers = {role: effect.channel_names()[role] for role in effect.needs()}
+        present = [str(name).removeprefix("channel_") for name in reduced.data_vars if str(name).startswith("channel_")]
+        for role, name in drivers.items():
+            if name not in present:
+                raise driver_error(effect, role, present)
+        windows = replace(windows_of(reduced, drivers), axes=tuple(axes[row] for row in rows))
+        seen = effect.explain(windows)
+        for name, values in seen.mean.items():
+            mean[rows] += _sizes(effect, name, windows.axes)[:, None] * values
+        for (term, name), values in seen.level.items():
+            level[rows, :, NOISE.index(term)] += (
+                square[rows, None, NOISE.index(term)] * _sizes(effect, name, windows.axes)[:, None] * values
+            )
+        for name, values in seen.spectrum.items():
+            added[rows] += _sizes(effect, name, windows.axes)[:, None, None] ** 2 * values
+        if seen.response is not None:
+            response[rows] *= seen.response
+        elsewhere = seen.marks or seen.wander or seen.transfer or seen.order or seen.phase_locked
+        if elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None):
+            left_out.append(effect.name)
+    return mean, (np.einsum("abfn,abn->abf", columns, np.maximum(level, 0.0)) + added) * response, left_out
+
+
+def _sizes(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
+    """A parameter for each axis."""
+    known = {one.name: one for one in effect.parameters()}
+    return effect.each(name, axes) if known[name].many else np.full(len(axes), float(getattr(effect, name)))

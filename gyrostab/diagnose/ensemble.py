@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from gyrostab.diagnose.baseline import line_columns, white_variance
+from gyrostab.diagnose.expected import line_columns, white_variance
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times
 from gyrostab.noise import HOUR
 

@@ -224,12 +224,13 @@ def power_factors(
         cells = np.repeat(chosen, shape[1])
         parts.append(power_products(residual[chosen].reshape(int(cells.sum()), -1), weight[chosen].ravel(), columns[cells]))
     products = _subset_products(parts, classes)
-    before: Array = np.asarray(np.diagonal(products[0].gram[0]))
-    extra = limits_of(before, before)[columns.shape[1] - count + level.shape[2] :]
-    more = np.diag(1.0 / np.square(np.where(extra > 0.0, extra, 1.0) * WIDTHS[-1]))
+    terms, own = len(precision), sum(one.size for one in numbers)
+    before = np.asarray(np.diagonal(products[0].gram[0]))
+    extra = limits_of(before, before)[own + terms :]
     full = np.zeros((count, count))
-    full[: level.shape[2], : level.shape[2]], full[level.shape[2] :, level.shape[2] :] = precision, more
-    limits = limits_of(before[: columns.shape[1] - count], np.diagonal(take_out(products[0], count, full).gram[0]))
+    full[:terms, :terms] = precision
+    full[terms:, terms:] = np.diag(1.0 / np.square(np.where(extra > 0.0, extra, 1.0) * WIDTHS[-1]))
+    limits = limits_of(before[:own], np.asarray(np.diagonal(take_out(products[0], count, full).gram[0])))
     out = np.stack([evidence(take_out(part, count, full), numbers, limits, np.zeros(1)) for part in products])
     out[:, 1:] -= out[:, :1]
     return out

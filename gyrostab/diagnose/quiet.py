@@ -63,7 +63,7 @@ def _span(reduced: xr.Dataset) -> float:
 
 
 def loudness(residual: Array, weight: Array) -> tuple[Array, Array]:
-    """Level of every block against what is expected, over the neighbourhood in which it stands out most.
+    """Level of every block against what is expected, over the smallest neighbourhood in which it stands out.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def loudness(residual: Array, weight: Array) -> tuple[Array, Array]:
     level : ndarray, shape (block,)
         Expected 1.
     deviation : ndarray, shape (block,)
-        How far it lies above 1 [standard deviations].
+        How far it lies above 1 where it does most [standard deviations].
     """
     use = np.where(np.isfinite(residual) & np.isfinite(weight), weight, 0.0)
     total = (use * np.nan_to_num(residual)).sum(axis=1, keepdims=True)
@@ -86,9 +86,11 @@ def loudness(residual: Array, weight: Array) -> tuple[Array, Array]:
     for span in LEVEL_SPANS:
         excess, shape = _running(total, span)[:, 0], _running(count, span)[:, 0]
         z = excess / np.sqrt(np.maximum(shape, 1e-9))
-        better = z > deviation
-        deviation[better] = z[better]
+        better = (z > deviation) & (deviation < _LOUD)
         level[better] = 1.0 + (excess / np.maximum(shape, 1e-9))[better]
+        deviation = np.maximum(deviation, z)
+    own, spread = 1.0 + total[:, 0] / np.maximum(count[:, 0], 1e-9), 3.0 / np.sqrt(np.maximum(count[:, 0], 1e-9))
+    level = np.clip(level, own / (1.0 + spread), np.maximum(own, 0.0) * (1.0 + spread) + spread)  # a neighbour's noise is not its own
     return level, deviation
 
 

@@ -1,0 +1,179 @@
+"""Calibration of the noise on simulated logs, and baselines of models and simulations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline import calibrate, from_model, from_simulation
+from gyrostab.diagnose.ensemble import null_records
+from gyrostab.diagnose.expected import common_variance, noise_powers, white_variance
+from gyrostab.diagnose.quiet import quiet_blocks
+from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.kernels.expected import expected_powers
+from gyrostab.kernels.periodogram import band_edges, ordinates, taper
+from gyrostab.noise import URAD_PER_S
+from gyrostab.simulate import simulate
+from gyrostab.simulate.noise import make_noise
+
+NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
+SHAKEN = {"profile": "vibration", "points": [[0, 0.02], [1199, 0.02], [1200, 6.0], [1500, 6.0], [1501, 0.02], [3600, 0.02]]}
+
+
+def log(noise=NOISE, *, seed=0, rate=10.0, duration="1h", axes=("x",), lost=0.0, effects=(), environment=()) -> xr.Dataset:
+    model = {"log": {"axes": list(axes)}, "noise": noise, "effect": list(effects), "environment": list(environment)}
+    made = simulate(model, duration=duration, rate=rate, seed=seed).compute()
+    if lost:
+        gone = np.random.default_rng(seed).random(made.sizes["time"]) < lost
+        made["rate"] = made["rate"].where(xr.DataArray(~gone, dims="time")).transpose("axis", "time").assign_attrs(made["rate"].attrs)
+    return made
+
+
+@pytest.mark.parametrize(("term", "size"), [("Q", 1.0 / URAD_PER_S), ("N", 1.0 / 60.0), ("B", 1.0), ("K", 60.0)])
+def test_expected_powers_are_those_of_simulated_noise(term, size):
+    length, rate, blocks = 500, 10.0, 800
+    weights, edges = taper(length), band_edges(length)
+    noise = make_noise(rate=rate, size=length * blocks, seed=5, **{term: size}).reshape(blocks, length)
+    spectra = np.fft.rfft((noise - noise.mean(axis=1, keepdims=True)) * weights)[:, 1 : ordinates(length) + 1]
+    ratio = (
+        (np.abs(spectra) ** 2).mean(axis=0)
+        / (rate * (weights**2).sum())
+        / expected_powers(weights, rate, ordinates(length))["QNBK".index(term)]
+    )
+    for low, high in zip(edges[:-1] - 1, edges[1:] - 1, strict=True):
+        assert ratio[low:high].mean() == pytest.approx(1.0, abs=4.5 / np.sqrt(blocks * (high - low)) + 0.01)
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_coefficients_lie_within_their_errors(lost):
+    noise = {"Q": 0.5, "N": 0.003, "B": 0.004, "K": 0.1}
+    axes = tuple("abcdefghijkl")
+    baseline = calibrate(reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3)))
+    for term, value in noise.items():
+        z = ((baseline["coefficient"] - value) / baseline["stderr"]).sel(term=term).values
+        assert (np.abs(z) < 2.0).mean() > 0.7, term
+        assert np.abs(z.mean()) < 1.2, term
+    assert float(baseline["stderr"].sel(term="N").max()) < 0.05 * noise["N"]
+    level = (reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3))["power"] / baseline["spectrum"]).mean(["axis", "block"])
+    np.testing.assert_allclose(level, 1.0, atol=0.12)
+
+
+def test_white_variance_is_that_of_block_means():
+    noise = {"Q": 2.0, "N": 0.003}
+    reduced = reduce_log(log(noise, axes=tuple("abcdef"), duration="2h", lost=0.3))
+    expected = white_variance(reduced, np.tile([4.0, 9e-6, 0.0, 0.0], (6, 1)))
+    ratio = (reduced["mean"].values ** 2).sum() / expected.sum()
+    assert ratio == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / expected.size))
+
+
+def test_powers_of_a_block_scatter_together_as_told():
+    reduced = reduce_log(log({"N": 0.003}, axes=tuple("abcdefgh"), duration="2h", lost=0.4))
+    common, rest = common_variance(reduced)
+    residual = (reduced["power"] / noise_powers(reduced)[..., 1] / 9e-6 - 1.0).values
+    total = (residual * rest).sum(axis=2) / rest.sum(axis=2)
+    expected = common + 1.0 / rest.sum(axis=2)
+    assert total.var() == pytest.approx(expected.mean(), rel=0.2)
+    assert common.mean() > 0.3 * expected.mean()
+    whole, _ = common_variance(reduce_log(log({"N": 0.003})))
+    assert np.abs(whole).max() < 1e-9
+
+
+def test_shaken_turning_and_warming_blocks_are_not_quiet():
+    warm = {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 30], [2700, 30], [3600, 60]]}
+    reduced = reduce_log(log(environment=[SHAKEN, warm], duration="1h"))
+    quiet, reason = quiet_blocks(reduced)
+    middle = ((reduced["begin"] + reduced["end"]) / 2.0).values
+    assert not quiet[0, (middle > 1210) & (middle < 1490)].any()
+    assert not quiet[0, middle > 2900].any()
+    assert quiet[0, middle < 1100].mean() > 0.9
+    assert "vibration" in reason
+    assert "temperature" in reason
+
+
+def test_a_loud_stretch_without_a_channel_is_not_calibrated_on():
+    effect = {"name": "vibration_noise", "white": 0.0006, "driver": "vibration"}
+    loud = reduce_log(log(effects=[effect], environment=[SHAKEN], rate=100.0)).drop_vars("channel_vibration")
+    baseline = calibrate(loud)
+    middle = ((loud["begin"] + loud["end"]) / 2.0).values
+    inside = (middle > 1220) & (middle < 1480)
+    assert not baseline["quiet"].values[0, inside].any()
+    assert baseline["quiet"].values[0, ~inside].mean() > 0.8
+    value, error = (float(baseline[name].sel(axis="x", term="N")) for name in ("coefficient", "stderr"))
+    assert abs(value - 0.003) < 4.0 * error
+    assert float(baseline["mean_variance"][0, inside].mean() / baseline["mean_variance"][0, middle < 1000].mean()) > 1.2
+
+
+def test_quiet_time_is_taken_as_named_and_checked():
+    reduced = reduce_log(log(rate=10.0))
+    begin, end = reduced["begin"].values, reduced["end"].values
+    for quiet in ((0.0, 1200.0), ("1970-01-01T00:00:00Z", "1970-01-01T00:20:00Z"), end <= 1200.0):
+        chosen = calibrate(reduced, quiet=quiet)["quiet"].values[0]
+        np.testing.assert_array_equal(chosen, (begin >= 0.0) & (end <= 1200.0))
+    assert calibrate(reduced, quiet=(0.0, 1200.0)).attrs["calibrated_on"] == [["1970-01-01T00:00:00.000Z", "1970-01-01T00:20:00.000Z"]]
+    with pytest.raises(OptionError, match=r"name .* s or more"):
+        calibrate(reduced, quiet=(0.0, 60.0))
+    with pytest.raises(OptionError, match="'soon' is neither"):
+        calibrate(reduced, quiet=("soon", "later"))
+
+
+def test_the_grid_holds_calibrated_and_far_redder_noise():
+    baseline = calibrate(reduce_log(log({"N": 0.003, "K": 0.3})))
+    K, weight = baseline["grid_K"].values[0], np.exp(baseline["grid_calibrated"].values[0])
+    assert weight.sum() == pytest.approx(1.0)
+    assert weight[(K > 0.1) & (K < 0.9)].sum() > 0.9
+    assert K.max() > 5.0 * 0.3
+    assert K.min() == 0.0
+    assert np.exp(baseline["grid_prior"].values[0]).sum() == pytest.approx(1.0)
+
+
+def test_a_model_is_taken_with_its_effects():
+    effects = [
+        {"name": "vibration_noise", "white": 0.001, "axes": ["x"]},
+        {"name": "temperature_bias", "sensitivity": 0.01, "axes": ["y"]},
+        {"name": "telegraph", "step": 0.1},
+    ]
+    warm = {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 30], [3600, 60]]}
+    model = {"noise": {"N": 0.003, "R": 0.1}, "effect": effects, "environment": [SHAKEN, warm], "log": {"axes": ["x", "y"]}}
+    made = simulate({**model, "effect": effects[:2]}, duration="1h", rate=10.0, seed=4).compute()
+    reduced = reduce_log(made)
+    baseline = from_model(reduced, model)
+    ratio = reduced["power"] / baseline["spectrum"]
+    shaken = (reduced["begin"].values > 1200) & (reduced["end"].values < 1500)
+    assert float(ratio.isel(block=shaken).mean()) == pytest.approx(1.0, abs=0.1)
+    assert float(ratio.isel(block=~shaken).mean()) == pytest.approx(1.0, abs=0.1)
+    assert float(baseline["spectrum"].sel(axis="x")[shaken].mean() / baseline["spectrum"].sel(axis="x")[~shaken].mean()) > 2.0
+    z = ((reduced["mean"] - baseline["known_mean"]) / np.sqrt(baseline["mean_variance"])).values
+    assert np.abs(z - z.mean(axis=1, keepdims=True)).max() < 5.0
+    assert baseline.attrs["left_out"] == ["telegraph"]
+    assert float(baseline["coefficient"].sel(axis="x", term="R")) == 0.1
+    assert float(baseline["stderr"].max()) == 0.0
+    nulls = next(iter(null_records(reduced, baseline, count=3, rng=np.random.default_rng(1))))
+    assert float((nulls["mean"] - baseline["known_mean"]).std()) < 2.0 * float(np.sqrt(baseline["mean_variance"].mean()))
+    with pytest.raises(SchemaError, match="temperature"):
+        from_model(reduced.drop_vars("channel_temperature"), model)
+    with pytest.raises(OptionError, match="no noise"):
+        from_model(reduced, {"noise": {"z": {"N": 1.0}}})
+
+
+def test_a_simulation_is_calibrated_and_keeps_its_level():
+    effect = {"name": "vibration_noise", "white": 0.002}
+    recording = reduce_log(log(effects=[effect], environment=[SHAKEN], seed=1))
+    simulated = reduce_log(log(effects=[effect], environment=[SHAKEN], seed=2))
+    baseline = from_simulation(recording, simulated)
+    shaken = (recording["begin"].values > 1220) & (recording["end"].values < 1480)
+    still = (recording["end"].values < 1000) | (recording["begin"].values > 1700)
+    ratio = recording["power"] / baseline["spectrum"]
+    assert float(ratio.isel(block=shaken).mean()) == pytest.approx(1.0, abs=0.2)
+    assert float(ratio.isel(block=still).mean()) == pytest.approx(1.0, abs=0.05)
+    assert baseline.attrs["source"] == "simulation"
+    with pytest.raises(SchemaError, match="--like"):
+        from_simulation(recording, reduce_log(log(rate=20.0)))
+
+
+def test_an_axis_without_spectra_is_named():
+    reduced = reduce_log(log(axes=("x", "y")))
+    reduced["power"].loc[{"axis": "y"}] = np.nan
+    with pytest.raises(SchemaError, match="axis y"):
+        calibrate(reduced)
