@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
+from gyrostab.diagnose.boxes import merged
 from gyrostab.diagnose.locate import locate
 from gyrostab.diagnose.null_scores import null_scores, smallest_p
 from gyrostab.diagnose.reduced import reduce_log
@@ -132,6 +133,28 @@ def test_two_bursts_are_two_boxes(base, null):
     assert boxes.sizes["mismatch"] == 2
     assert begins[0] == pytest.approx(600.0, abs=2 * BLOCK_S)
     assert begins[1] == pytest.approx(2000.0, abs=2 * BLOCK_S)
+
+
+def test_a_mean_that_wanders_is_one_mismatch(base, null):
+    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    found["mean"][1] += 0.5 * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
+    boxes = locate(found, base, null)
+    boxes = boxes.sel(mismatch=boxes["view"] == "mean")
+    assert boxes["what"].values.tolist() == ["wander"]
+    assert float(boxes["end"][0] - boxes["begin"][0]) > 3000.0
+    assert abs(float(boxes["estimate"][0])) == pytest.approx(0.4, abs=0.15)
+
+
+def test_pieces_become_one_box_and_strangers_do_not():
+    box = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 100.0, "tau_min_s": 0.01, "tau_max_s": 0.1}
+    box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
+    near, far = box | {"begin": 120.0, "end": 160.0, "z": 6.0}, box | {"begin": 400.0, "end": 460.0, "z": 6.0}
+    assert [(one["begin"], one["end"]) for one in merged([far, near, box])] == [(0.0, 160.0), (400.0, 460.0)]
+    assert len(merged([box, box | {"sign": -1}])) == 2
+    assert len(merged([box, box | {"tau_min_s": 1.0, "tau_max_s": 2.0}])) == 2
+    line = box | {"view": "spectrum", "what": "line", "frequency": 13.35, "tau_min_s": 0.028, "tau_max_s": 0.028}
+    assert len(merged([line, line | {"frequency": 13.45, "begin": 100.0, "end": 200.0}])) == 1
+    assert len(merged([line, line | {"frequency": 14.35}])) == 2
 
 
 # -- the whole way from samples ------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.boxes import merged, wandering
 from gyrostab.diagnose.null_scores import NullScores, null_scores, standardise
 from gyrostab.diagnose.views import VIEWS
 from gyrostab.diagnose.views.mean import box_mean
@@ -21,7 +22,7 @@ _RAISED = 2.0  # of a piece that has a part in a mismatch
 _WHOLE = 0.7  # that a part of the record must show more than the whole does
 _GROWN = 3.0  # standard deviations of a cell that belongs to a mismatch beside it
 _MOST = 8  # mismatches of one view and row
-_TOLD = 40  # mismatches of a record
+_TOLD = 30  # mismatches of a record
 _BESIDE_LINE = 3  # lines that a strong line leaks into
 
 #: Fields of a mismatch, and their units.
@@ -87,8 +88,7 @@ def locate(reduced: xr.Dataset, baseline: xr.Dataset, nulls: Iterable[xr.Dataset
             continue
         find = _mean_boxes if name == "mean" else _boxes
         boxes += find(name, score, reduced, baseline, null, level)
-    merged = _merged(sorted(boxes, key=lambda box: (box["p_value"], -abs(box["z"]))))
-    return _table(merged[:_TOLD], reduced, null, level)
+    return _table(merged(boxes)[:_TOLD], reduced, null, level)
 
 
 def _boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float) -> list[dict[str, Any]]:
@@ -127,7 +127,7 @@ def _mean_boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset
             found.append(box)
         if not open_rows:
             break
-    return found
+    return wandering(found)
 
 
 def _next_box(scores: xr.Dataset, row: int, left: Array, z: Array, critical: float) -> dict[str, Any] | None:
@@ -136,7 +136,8 @@ def _next_box(scores: xr.Dataset, row: int, left: Array, z: Array, critical: flo
         return None
     window, column = np.unravel_index(np.nanargmax(np.abs(left)), left.shape)
     sign = 1.0 if left[window, column] > 0 else -1.0
-    begin, end, fine = _span(scores, z[:, column] * sign, int(window))
+    free = np.where(np.isfinite(left[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0)  # what is explained counts for nothing
+    begin, end, fine = _span(scores, free * sign, int(window))
     together, ratio = _stacked(scores, row, z * sign, fine, int(window))
     columns, reach = _columns(scores, together, ratio, int(column))
     box = {
@@ -230,31 +231,6 @@ def _columns(scores: xr.Dataset, together: Array, ratio: Array, column: int) -> 
         return np.array([column]), np.arange(max(lower - beside, 0), min(upper + beside + 1, what.size))
     overlap = (low <= high[grown].max() * 1.01) & (high >= low[grown].min() * 0.99)
     return box, np.flatnonzero(overlap)
-
-
-def _merged(boxes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One mismatch of boxes of several axes, or boxes that touch, which show the same; the surest gives its numbers."""
-    kept: list[dict[str, Any]] = []
-    for box in boxes:
-        for other in kept:
-            if _same(box, other):
-                names = [*other["axes"].split(), *(name for name in box["axes"].split() if name not in other["axes"].split())]
-                other["axes"] = " ".join(names)
-                break
-        else:
-            kept.append(dict(box))
-    return kept
-
-
-def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    if one["view"] != other["view"] or (one["sign"] != other["sign"] and one["view"] != "cross_axis"):
-        return False
-    if one["view"] == "spectrum" and one["frequency"] == one["frequency"] and abs(one["frequency"] / other["frequency"] - 1.0) > 0.02:
-        return False
-    shared = min(one["end"], other["end"]) - max(one["begin"], other["begin"])
-    together = max(one["end"], other["end"]) - min(one["begin"], other["begin"])
-    overlap = min(one["tau_max_s"], other["tau_max_s"]) >= 0.99 * max(one["tau_min_s"], other["tau_min_s"])
-    return bool(overlap and shared > 0.5 * together)
 
 
 def _table(boxes: list[dict[str, Any]], reduced: xr.Dataset, null: NullScores, level: float) -> xr.Dataset:
