@@ -140,7 +140,7 @@ def test_a_mean_that_wanders_is_one_mismatch(base, null):
     found["mean"][1] += 0.5 * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
     boxes = locate(found, base, null)
     boxes = boxes.sel(mismatch=boxes["view"] == "mean")
-    assert boxes["what"].values.tolist() == ["wander"]
+    assert boxes["sign"].values.tolist() == [0]
     assert float(boxes["end"][0] - boxes["begin"][0]) > 3000.0
     assert abs(float(boxes["estimate"][0])) == pytest.approx(0.4, abs=0.15)
 

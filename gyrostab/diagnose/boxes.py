@@ -91,6 +91,6 @@ def wandering(boxes: Sequence[Box]) -> list[Box]:
         if len(mine) > _STEPS:
             largest = max(mine, key=lambda box: abs(box["z"]))
             begin, end = min(box["begin"] for box in mine), max(box["end"] for box in mine)
-            mine = [largest | {"what": "wander", "begin": begin, "end": end, "tau_max_s": end - begin}]
+            mine = [largest | {"sign": 0, "begin": begin, "end": end, "tau_max_s": end - begin}]
         found += mine
     return found

@@ -65,8 +65,9 @@ def locate(reduced: xr.Dataset, baseline: xr.Dataset, nulls: Iterable[xr.Dataset
     -------
     xarray.Dataset
         By ``mismatch``, the surest first: ``view``, ``axes`` (parted by blanks), ``what``, ``begin``, ``end`` [s since the start],
-        ``start_time``, ``end_time``, ``tau_min_s``, ``tau_max_s`` [s], ``frequency`` [Hz], ``sign``, ``z``, ``ratio`` (observed over
-        expected; in the mean and restart views the number of standard deviations), ``estimate`` (see the view), ``p_value``.
+        ``start_time``, ``end_time``, ``tau_min_s``, ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``,
+        ``ratio`` (observed over expected; in the mean and restart views the number of standard deviations), ``estimate`` (see the
+        view), ``p_value``.
 
     Raises
     ------

@@ -208,6 +208,8 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
             f"{begin} {verb} {what} than simulated {when}, at {taus}: {'its' if one else 'their'} Allan variance is "
             f"{box['ratio']:.3g} times the expected one ({sure})."
         )
+    if box["view"] == "mean" and box.get("sign", 1) == 0:
+        return f"The mean rate of {axes} wanders {when} by more than drift and noise allow, {abs(estimate):.3g} deg/h at most ({sure})."
     if box["view"] == "mean":
         size = f" by {abs(estimate):.3g} deg/h" if np.isfinite(estimate) else ""
         return f"The mean rate of {axes} is {'higher' if more else 'lower'}{size} {when} than drift and noise allow ({sure})."
