@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from gyrostab.correlate import correlate as correlate
     from gyrostab.correlate import correlation_rows as correlation_rows
     from gyrostab.davar import davar as davar
+    from gyrostab.diagnose.core import diagnose as diagnose
+    from gyrostab.diagnose.result import Diagnosis as Diagnosis
+    from gyrostab.diagnosis import open_diagnosis as open_diagnosis
+    from gyrostab.diagnosis import write_diagnosis as write_diagnosis
     from gyrostab.export import open_log as open_log
     from gyrostab.export import open_product as open_product
     from gyrostab.export import open_surface as open_surface
@@ -49,14 +53,17 @@ if TYPE_CHECKING:
 
 # public name -> module that holds it
 _HOME = {
+    "Diagnosis": "diagnose.result",
     "confidence_interval": "confidence",
     "correlate": "correlate",
     "correlation_rows": "correlate",
     "davar": "davar",
+    "diagnose": "diagnose.core",
     "fit_noise": "fit",
     "gap_table": "regularise",
     "make_log": "log",
     "make_noise": "simulate",
+    "open_diagnosis": "diagnosis",
     "open_log": "export",
     "open_product": "export",
     "open_surface": "export",
@@ -76,19 +83,23 @@ _HOME = {
     "to_kalibr": "kalibr",
     "to_netcdf": "export",
     "to_zarr": "export",
+    "write_diagnosis": "diagnosis",
     "write_report": "report",
 }
 
 __all__ = [
+    "Diagnosis",
     "__version__",
     "confidence_interval",
     "correlate",
     "correlation_rows",
     "davar",
+    "diagnose",
     "fit_noise",
     "gap_table",
     "make_log",
     "make_noise",
+    "open_diagnosis",
     "open_log",
     "open_product",
     "open_surface",
@@ -108,6 +119,7 @@ __all__ = [
     "to_kalibr",
     "to_netcdf",
     "to_zarr",
+    "write_diagnosis",
     "write_report",
 ]
 

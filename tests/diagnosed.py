@@ -33,6 +33,7 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
     after[0, loud] *= 1.8
     edf = np.maximum(100.0 / tau, 2.0)
     recording = after * rng.chisquare(edf, after.shape) / edf
+    z = np.minimum(1.96 * np.sqrt(2.0 / edf), 0.9)
     block = np.arange(0.0, 3600.0, 20.0)
     shift = np.zeros((len(axes), block.size))
     shift[0, (block >= 1500) & (block < 1800)] = 0.08
@@ -44,6 +45,8 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
     return xr.Dataset(
         {
             "avar": (("case", "axis", "window", "tau"), np.stack([recording, plain, after]), {"units": "degree2 hour-2"}),
+            "avar_low": (("case", "axis", "window", "tau"), np.stack([recording * np.nan, plain * (1 - z), after * (1 - z)])),
+            "avar_high": (("case", "axis", "window", "tau"), np.stack([recording * np.nan, plain * (1 + z), after * (1 + z)])),
             "mean": (("case", "axis", "window"), mean, {"units": "degree hour-1"}),
             "mean_stderr": (("case", "axis", "window"), np.full(mean.shape, 0.018), {"units": "degree hour-1"}),
             "block_mean": (("axis", "block"), shift + 0.04 * rng.standard_normal(shift.shape), {"units": "degree hour-1"}),

@@ -16,7 +16,7 @@ from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import Effect
 
-__all__ = ["MISMATCH_VIEWS", "SCHEMA", "VERDICTS", "Diagnosis", "check_diagnosis", "effect_table", "model_text", "plain"]
+__all__ = ["HELD_OUT", "MISMATCH_VIEWS", "SCHEMA", "VERDICTS", "Diagnosis", "check_diagnosis", "effect_table", "model_text", "plain"]
 
 SCHEMA = "gyrostab.diagnosis/1"
 VERDICTS = ("no mismatch", "explained", "partly explained", "unknown")
@@ -128,6 +128,9 @@ _FIELDS: dict[str, dict[str, Any]] = {
         "coverage95_before": _LATER, "coverage95_after": _LATER, "forecast_gain": _LATER,
     },
 }  # fmt: skip
+
+#: What is told of held-out time.
+HELD_OUT = tuple(_FIELDS["held_out"])
 
 
 def _require(table: Any, kind: str, where: str) -> None:

@@ -216,6 +216,14 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
     if box["view"] == "cross_axis":
         size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
         return f"{begin} vary together{size} {when}, at {taus}, which independent gyros do not ({sure})."
+    what = str(box.get("what", ""))
+    if box["view"] == "spectrum" and what.startswith("order"):
+        return (
+            f"The rate of {axes} has a part of {estimate:.3g} deg/h that turns {what.removeprefix('order ')} times with every turn of the "
+            f"tool {when} ({sure})."
+        )
+    if box["view"] == "spectrum" and what == "ramp phase":
+        return f"The rate of {axes} has a part of {estimate:.3g} deg/h rms that follows the phase of the feedback ramp {when} ({sure})."
     if box["view"] == "spectrum":
         return (
             f"The spectrum of {axes} has a line at {box.get('frequency', np.nan):.5g} Hz {when}, {box['ratio']:.3g} times the level "
@@ -223,8 +231,8 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
         )
     if box["view"] == "restart":
         return f"The rate of {axes} does not begin where it ended when the power comes back ({sure})."
-    what = _MARKS.get(str(box.get("what")), "an unusual distribution of its samples")
-    return f"{begin} {'has' if one else 'have'} {what} {when} ({sure})."
+    told = _MARKS.get(what, "an unusual distribution of its samples")
+    return f"{begin} {'has' if one else 'have'} {told} {when} ({sure})."
 
 
 _MARKS = {

@@ -25,6 +25,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "after": {"color": COLOURS[0], "lw": 1.6},
 }
 _MOST_CHANNELS = 3
+_PALE = 0.3  # opacity of what chance does in 95 of 100
 _LEAST_WIDTH = 0.012  # of the panel, that a box is drawn
 
 
@@ -81,9 +82,11 @@ def _boxes(panel: Axes, axis: str, content: Mapping[str, Any], size: float, *, t
 
 
 def _maps(
-    surfaces: xr.Dataset, content: Mapping[str, Any], columns: Sequence[tuple[str, Array]], norm: Any, cmap: str, label: str
+    surfaces: xr.Dataset, content: Mapping[str, Any], columns: Sequence[tuple[str, Array, Any]], norm: Any, cmap: str, label: str
 ) -> Figure:
-    """One row of maps an axis; `columns` are titles and values by (axis, window, tau)."""
+    """One row of maps an axis; `columns` are titles, values by (axis, window, tau), and how opaque each is, None for all."""
+    from matplotlib.cm import ScalarMappable
+
     names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
     begin, end = surfaces["begin"].values, surfaces["end"].values
     size, unit = _unit_of_time(float(end[-1]))
@@ -92,11 +95,14 @@ def _maps(
     figure.subplots_adjust(left=0.075, right=0.9, top=1.0 - 0.35 / height, bottom=0.6 / height, wspace=0.06, hspace=0.08)
     panels = figure.subplots(len(names), len(columns), sharex=True, sharey=True, squeeze=False)
     for row, name in enumerate(names):
-        for column, (title, values) in enumerate(columns):
+        for column, (title, values, opaque) in enumerate(columns):
             panel = panels[row, column]
-            panel.set_facecolor("#d0d0d0")
+            edges = _edges(begin, end) / size, _log_edges(tau)
+            missing = np.ma.masked_where(np.isfinite(values[row]), np.full(values[row].shape, 0.2))
+            panel.pcolormesh(*edges, missing.T, cmap="Greys", vmin=0.0, vmax=1.0, rasterized=True)
+            alpha = None if opaque is None else np.where(np.isfinite(values[row]), opaque[row], 0.0).T
             shown = np.ma.masked_invalid(values[row])
-            mesh = panel.pcolormesh(_edges(begin, end) / size, _log_edges(tau), shown.T, norm=norm, cmap=cmap, rasterized=True)
+            panel.pcolormesh(*edges, shown.T, norm=norm, cmap=cmap, rasterized=True, alpha=alpha)
             panel.set_yscale("log")
             panel.set_xlim(begin[0] / size, end[-1] / size)
             panel.set_ylim(*_log_edges(tau)[[0, -1]])
@@ -108,7 +114,8 @@ def _maps(
             if row == len(names) - 1:
                 panel.set_xlabel(f"time since the start [{unit}]")
     label_log_axis(panels[0, 0].yaxis, tau[0], tau[-1])
-    figure.colorbar(mesh, cax=figure.add_axes((0.912, 0.6 / height, 0.013, 1.0 - 0.95 / height)), label=label)
+    bar = ScalarMappable(norm, cmap)  # the maps may be partly transparent
+    figure.colorbar(bar, cax=figure.add_axes((0.912, 0.6 / height, 0.013, 1.0 - 0.95 / height)), label=label)
     return figure
 
 
@@ -132,7 +139,7 @@ def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     positive = deviation[np.isfinite(deviation) & (deviation > 0)]
     norm = LogNorm(*(np.quantile(positive, [0.005, 0.995]) if positive.size else (0.1, 1.0)))
     cases = [str(name) for name in surfaces["case"].values]
-    columns = [(_TITLES.get(name, name), deviation[place]) for place, name in enumerate(cases)]
+    columns = [(_TITLES.get(name, name), deviation[place], None) for place, name in enumerate(cases)]
     return _maps(surfaces, content, columns, norm, "viridis", "Allan deviation [deg/h]")
 
 
@@ -141,11 +148,14 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import FixedLocator, NullFormatter
 
-    avar = surfaces["avar"].transpose("case", "axis", "window", "tau")
+    avar, low, high = (surfaces[name].transpose("case", "axis", "window", "tau") for name in ("avar", "avar_low", "avar_high"))
     recording = avar.sel(case="recording").values
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratios = {name: np.sqrt(recording / avar.sel(case=name).values) for name in ("before", "after")}
-    columns = [(f"Recording over {_TITLES[name].lower()}", values) for name, values in ratios.items()]
+    columns = []
+    for name in ("before", "after"):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = np.sqrt(recording / avar.sel(case=name).values)
+            usual = (recording >= low.sel(case=name).values) & (recording <= high.sel(case=name).values)
+        columns.append((f"Recording over {_TITLES[name].lower()}", ratio, np.where(usual, _PALE, 1.0)))
     figure = _maps(surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations")
     bar = figure.axes[-1]
     bar.yaxis.set_major_locator(FixedLocator([0.5, 0.7, 1.0, 1.4, 2.0]))
@@ -209,7 +219,7 @@ def _channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[str]:
     named = [name.strip() for effect in content["effects"] for name in str(effect["driver"] or "").split(",")]
     usual = [name for name in ("temperature", "vibration", "rotation_rate") if name in there]
     first = [name for name in dict.fromkeys(named) if name in there]
-    return [*first, *(name for name in (*usual, *there) if name not in first)][:_MOST_CHANNELS] if first else list(dict.fromkeys(usual))
+    return list(dict.fromkeys([*first, *usual]))[:_MOST_CHANNELS]
 
 
 def _mark_spans(panel: Axes, axis: str, content: Mapping[str, Any], size: float) -> None:

@@ -90,7 +90,9 @@ def write_diagnosis_report(diagnosis: Diagnosis, path: str | os.PathLike[str], *
 
 
 def _number(value: Any, digits: int = 3) -> str:
-    return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
 
 
 def _stamp(text: str) -> str:
@@ -224,8 +226,8 @@ _READ = {
     ),
     "change": (
         "The recording divided by the simulation: white where they agree, orange where the recording is noisier, purple where it is "
-        "quieter. Scattered single cells are chance, mostly at the top, where a window holds few averages. Right: what is left with the "
-        "effects added."
+        "quieter. Pale cells lie within what chance does in 95 of 100 cells; full colours are what counts, and a few scattered ones are "
+        "chance too. Right: what is left with the effects added."
     ),
     "means": (
         "What is constant within a window does not show in the figures above, but here: each dot is the mean rate of a short block. The "

@@ -1,0 +1,77 @@
+"""A recording against a simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from gyrostab.cli.frame import app, work
+from gyrostab.options import Common, Reading
+
+__all__ = ["diagnose"]
+
+
+@app.command(sort_key=11, help_epilogue="")
+def diagnose(
+    recording: Annotated[list[Path], Parameter(name="RECORDING...", negative=())],
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")] = Path("diagnosis"),
+    simulation: Annotated[Path | None, Parameter(metavar="MODEL.toml|SIM.nc")] = None,
+    quiet: Annotated[list[str] | None, Parameter(metavar="START/END", negative=())] = None,
+    block: Annotated[str | None, Parameter(metavar="DURATION")] = None,
+    level: Annotated[float, Parameter(validator=Number(gt=0, lt=0.5))] = 0.01,
+    nulls: Annotated[int, Parameter(validator=Number(gte=100))] = 400,
+    seed: Annotated[int, Parameter(metavar="N", validator=Number(gte=0))] = 0,
+    reading: Reading = Reading(),
+    common: Common = Common(),
+) -> None:
+    """Find where a recording differs from its simulation, name the physics that is missing, and add it to the model.
+
+    Writes diagnosis.json, model.toml (for gyrostab simulate), diagnosis.nc and report.html into a folder, and prints the verdict.
+
+    Example: gyrostab diagnose run7.nc -o run7-diagnosis
+
+    Parameters
+    ----------
+    recording
+        One or more logs of the recording, in any format that gyrostab reads, with its channels.
+    output
+        Folder to make.
+    simulation
+        What the recording is compared with: a model, or a simulated log on the same stamps (default: noise calibrated on quiet
+        stretches of the recording).
+    quiet
+        Stretch of the recording in which nothing happens, for the calibration: 2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after
+        the start. Repeat for more (default: found by itself).
+    block
+        Length of the blocks that are looked at (default: 20s, less in short records).
+    level
+        Chance that anything is found where nothing is.
+    nulls
+        Simulated records that say what noise alone does.
+    seed
+        Of these records.
+    """
+    from gyrostab.diagnose.core import diagnose as run_diagnosis
+    from gyrostab.diagnose.core import quiet_span
+    from gyrostab.diagnosis import write_diagnosis
+    from gyrostab.diagnosis.files import check_folder
+    from gyrostab.run import load_log
+
+    check_folder(output, overwrite=common.overwrite)
+    spans = [quiet_span(text) for text in quiet or ()]
+    with work(common) as stage:
+        stage("reading", 0)
+        log = load_log(recording, **reading.options())
+        expected = load_log([simulation]) if simulation and simulation.suffix.lower() != ".toml" else simulation
+        diagnosis = run_diagnosis(
+            log, simulation=expected, quiet=spans or None, block=block, false_alarm_level=level, nulls=nulls, seed=seed, progress=stage
+        )
+        stage("drawing", 0)
+        files = write_diagnosis(diagnosis, output, overwrite=common.overwrite)
+    print(diagnosis)
+    print("\nwritten:", *(f"  {file}" for file in files), sep="\n")

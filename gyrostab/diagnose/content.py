@@ -1,0 +1,230 @@
+"""The tables of `diagnosis.json` from what the steps of a diagnosis found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.account import acting, spans
+from gyrostab.diagnose.generics import GENERICS
+from gyrostab.diagnose.name import Claim, Naming, Unknown
+from gyrostab.diagnose.refit import Fitted, Limit
+from gyrostab.diagnose.result import effect_table
+from gyrostab.diagnose.sentences import axes_text, chance, effect_statement, mismatch_statement, plain_name, span_text
+from gyrostab.noise import LAWS
+from gyrostab.simulate.model import Model
+
+__all__ = [
+    "baseline_table",
+    "chance_of_gain",
+    "iso",
+    "mismatch_tables",
+    "recording_table",
+    "surfaces_with_blocks",
+    "unknown_tables",
+    "verdict",
+]
+
+Array = NDArray[np.float64]
+_TAIL = 0.25
+_LEAST_P = 1e-12
+#: Generic -> view in which it is told.
+_GENERIC_VIEW = {"~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution"}
+_MOST_LINES = 4000
+
+
+def iso(reduced: xr.Dataset, seconds: float) -> str:
+    """Time [s since the start of the record] as ISO 8601."""
+    start = np.datetime64(int(reduced.attrs["start_ns"]), "ns")
+    return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
+
+
+def recording_table(reduced: xr.Dataset) -> dict[str, Any]:
+    """What the recording is."""
+    channels = [str(name).removeprefix("channel_") for name in reduced.data_vars if str(name).startswith("channel_")]
+    return {
+        "files": [str(name) for name in reduced.attrs["source_files"]],
+        "axes": [str(axis) for axis in reduced["axis"].values],
+        "start": reduced.attrs["start"],
+        "end": reduced.attrs["end"],
+        "sampling_rate_hz": float(reduced.attrs["sampling_rate_hz"]),
+        "channels": channels,
+        "missing_share": float(reduced.attrs["missing_share"]),
+    }
+
+
+def baseline_table(baseline: xr.Dataset) -> dict[str, Any]:
+    """The noise that the recording is compared with."""
+    noise: dict[str, Any] = {}
+    for axis in baseline["axis"].values:
+        noise[str(axis)] = {}
+        for term in baseline["term"].values:
+            value, error = (float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr"))
+            noise[str(axis)][str(term)] = {"value": value, "stderr": error if math.isfinite(error) else None, "unit": LAWS[str(term)].label}
+    spans = baseline.attrs.get("calibrated_on", [])
+    return {"source": baseline.attrs["source"], "noise": noise, "calibrated_on": [list(span) for span in spans]}
+
+
+def mismatch_tables(found: xr.Dataset, reduced: xr.Dataset, explained: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
+    """The mismatches, each with its sentence."""
+    whole = float(reduced["end"].values[-1])
+    out = []
+    for number, names in enumerate(explained):
+        box = {str(name): found[name].values[number].item() for name in found.data_vars if found[name].dtype.kind != "M"}
+        box["axes"] = str(box["axes"]).split()
+        out.append(
+            {
+                "id": number + 1,
+                "view": box["view"],
+                "axes": box["axes"],
+                "start": iso(reduced, box["begin"]),
+                "end": iso(reduced, box["end"]),
+                "tau_min_s": box["tau_min_s"],
+                "tau_max_s": box["tau_max_s"],
+                "ratio": box["ratio"],
+                "p_value": box["p_value"],
+                "explained_by": list(names),
+                "statement": mismatch_statement(box, whole),
+            }
+        )
+    return out
+
+
+def chance_of_gain(best: Array, gain: float) -> float:
+    """Share of null records whose largest gain is `gain` or more; by an exponential tail beyond their upper quarter."""
+    start = float(np.quantile(best, 1.0 - _TAIL))
+    if gain <= start:
+        return float((best >= gain).mean())
+    scale = max(float((best[best > start] - start).mean()), 0.1)
+    return max(_TAIL * math.exp(-(gain - start) / scale), _LEAST_P)
+
+
+def unknown_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Mismatches that only naming saw: what no effect explains, where no box that is left says so already."""
+    out: list[dict[str, Any]] = []
+    for one in naming.unknown:
+        view = _GENERIC_VIEW.get(one.generic, "davar")
+        told = any(box["view"] == view and set(box["axes"]) & set(one.axes) and not box["explained_by"] for box in known)
+        if not told:
+            out.append(_unknown_table(one, naming, reduced, len(known) + len(out) + 1, view))
+    return out
+
+
+def _unknown_table(one: Unknown, naming: Naming, reduced: xr.Dataset, number: int, view: str) -> dict[str, Any]:
+    p_value = chance_of_gain(naming.null_best, one.gain)
+    near = ", ".join(plain_name(name) for name in one.candidates)
+    beside = f"; what comes nearest: {near}" if near else ""
+    means, what = view == "mean", GENERICS.get(one.generic, "something differs")
+    rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
+    return {
+        "id": number,
+        "view": view,
+        "axes": list(one.axes),
+        "start": iso(reduced, float(reduced["begin"].values[0])),
+        "end": iso(reduced, float(reduced["end"].values[-1])),
+        "tau_min_s": block if means else 1.0 / rate,
+        "tau_max_s": float(reduced["end"].values[-1]) / 2.0 if means else block,
+        "ratio": None,
+        "p_value": p_value,
+        "explained_by": [],
+        "statement": f"On {axes_text(one.axes)} {what}, and no known effect says why{beside} ({chance(p_value)}).",
+    }
+
+
+def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[str, Any]]:
+    """The named effects, the strongest first.
+
+    The standard error of a held-out gain is the one that the logarithm of a likelihood ratio has where the model is right: the root of
+    twice the gain.
+    """
+    begin, end = reduced["begin"].values, reduced["end"].values
+    out = []
+    for one in fitted:
+        claim = one.claim
+        mine = sum(max(part.gain, 0.0) for part in claim.parts if set(part.row) & set(one.axes))
+        gain = claim.gain if set(one.axes) == set(claim.axes) else mine
+        when = spans(acting(claim, begin.size), begin, end)
+        whole = float(end[-1])
+        out.append(
+            {
+                "name": claim.effect,
+                "axes": list(one.axes),
+                "driver": ",".join(filter(None, claim.driver)) or None,
+                "intervals": [[iso(reduced, low), iso(reduced, high)] for low, high in when],
+                "parameters": {name: asdict(estimate) for name, estimate in one.parameters.items()},
+                "held_out_gain": {"nats": gain, "stderr": math.sqrt(2.0 * max(gain, 0.0)), "threshold": claim.threshold},
+                "alternatives": list(claim.alternatives),
+                "statement": effect_statement(
+                    one.say(),
+                    alternatives=claim.alternatives,
+                    intervals=[] if when == [(float(begin[0]), whole)] else [span_text(*span, whole) for span in when],
+                ),
+            }
+        )
+    return sorted(out, key=lambda table: -table["held_out_gain"]["nats"])
+
+
+def limit_tables(found: Mapping[str, Limit]) -> dict[str, Any]:
+    """How large what was not found may be, and why it was not."""
+    return {name: {"upper_limit": one.upper_limit, "unit": one.unit, "reason": one.reason} for name, one in found.items()}
+
+
+def model_tables(baseline: xr.Dataset, fitted: Sequence[Fitted], own: Model | None) -> dict[str, Any]:
+    """The simulation with the effects added, as the tables of a model; `own` is the model that was given."""
+    noise = {
+        str(axis): {str(term): float(f"{float(baseline['coefficient'].sel(axis=axis, term=term)):.6g}") for term in baseline["term"].values}
+        for axis in baseline["axis"].values
+    }
+    before = [effect_table(effect) for effect in own.effects] if own is not None else []
+    return {"noise": noise, "effect": [*before, *(effect_table(one.effect) for one in fitted if one.effect is not None)]}
+
+
+def verdict(mismatches: Sequence[Mapping[str, Any]], claims: Sequence[Claim], unexplained: Sequence[int]) -> str:
+    """One of `gyrostab.diagnose.result.VERDICTS`."""
+    if not claims:
+        return "unknown" if mismatches else "no mismatch"
+    return "partly explained" if unexplained else "explained"
+
+
+def surfaces_with_blocks(surfaces: xr.Dataset, reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
+    """The surfaces with what else the report draws: block means, channels, and spectra of the whole record."""
+    power = "degree2 hour-2 s"
+    channels = {str(name): reduced[name] for name in reduced.data_vars if str(name).startswith("channel_")}
+    with np.errstate(invalid="ignore"):
+        cases = [reduced["power"], before["spectrum"], after["spectrum"]]
+        there = np.isfinite(reduced["power"].transpose("axis", "block", "band").values)
+        density = np.stack([_mean_where(one.transpose("axis", "block", "band").values, there) for one in cases])
+        lines = reduced["line_power"].weighted(reduced["line_weight"].fillna(0.0)).mean("part")
+    step = max(1, lines.sizes["line"] // _MOST_LINES)
+    lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines
+    frequency = reduced["line_frequency"].coarsen(line=step, boundary="trim").mean() if step > 1 else reduced["line_frequency"]
+    added = xr.Dataset(
+        {
+            "block_mean": (("axis", "block"), reduced["mean"].transpose("axis", "block").values, dict(reduced["mean"].attrs)),
+            "density": (("case", "axis", "band"), density, {"units": power, "long_name": "two-sided power density of the record"}),
+            "line_density": (
+                ("axis", "line"),
+                lines.transpose("axis", "line").values,
+                {"units": power, "long_name": "two-sided power density of the recording at full resolution"},
+            ),
+            **{name: ("block", values.values, dict(values.attrs)) for name, values in channels.items()},
+        },
+        coords={
+            "block_begin": ("block", reduced["begin"].values, dict(reduced["begin"].attrs)),
+            "block_end": ("block", reduced["end"].values, dict(reduced["end"].attrs)),
+            "frequency": ("band", reduced["frequency"].values, dict(reduced["frequency"].attrs)),
+            "line_frequency": ("line", frequency.values, dict(reduced["line_frequency"].attrs)),
+        },
+    )
+    return surfaces.merge(added, compat="no_conflicts", join="exact")
+
+
+def _mean_where(values: Array, there: NDArray[np.bool_]) -> Array:
+    count = there.sum(axis=1)
+    return np.asarray(np.divide(np.where(there, values, 0.0).sum(axis=1), count, out=np.full(count.shape, np.nan), where=count > 0))

@@ -1,0 +1,242 @@
+"""A recording against a simulation: reduce, calibrate, locate, name, refit, prove."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.account import explanations
+from gyrostab.diagnose.baseline import calibrate, from_model, from_simulation
+from gyrostab.diagnose.content import (
+    baseline_table,
+    effect_tables,
+    limit_tables,
+    mismatch_tables,
+    model_tables,
+    recording_table,
+    surfaces_with_blocks,
+    unknown_tables,
+    verdict,
+)
+from gyrostab.diagnose.ensemble import null_records
+from gyrostab.diagnose.evidence import held_out
+from gyrostab.diagnose.locate import locate
+from gyrostab.diagnose.name import Naming, name_effects
+from gyrostab.diagnose.null_scores import NullScores, null_scores
+from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.refit import fit_claims, limits, predicted
+from gyrostab.diagnose.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
+from gyrostab.diagnose.surfaces import make_surfaces
+from gyrostab.errors import OptionError
+from gyrostab.progress import Stage, no_stage
+from gyrostab.schema import check_log
+from gyrostab.simulate.model import Model, read_model
+from gyrostab.timegrid import first_stamp
+from gyrostab.windows import duration_seconds
+
+__all__ = ["diagnose", "quiet_span"]
+
+_KEPT = 3e8  # bytes of null records that are kept rather than drawn twice
+_LEAST_NULLS = 100
+
+
+def diagnose(
+    log: xr.Dataset,
+    *,
+    simulation: str | os.PathLike[str] | Mapping[str, Any] | Model | xr.Dataset | None = None,
+    quiet: Any = None,
+    seed: int = 0,
+    nulls: int = 400,
+    false_alarm_level: float = 0.01,
+    block: Any = None,
+    restart_gap: Any = 5.0,
+    progress: Stage = no_stage,
+) -> Diagnosis:
+    """Find where a recording differs from a simulation, name the physics that is missing, and measure what it is worth.
+
+    The recording is reduced to block statistics; null records with the noise of the simulation say how far chance goes; places that lie
+    beyond become mismatches; effects are named by what they explain on time that was kept apart, fitted together, and added to the model.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        The recording: a regular log with its channels, in memory or lazy.
+    simulation : model, path of a model, or xarray.Dataset, optional
+        What it is compared with: noise and effects of a model, or a simulated log on the same stamps. Without it the five noise terms,
+        calibrated on quiet stretches of the recording.
+    quiet : (start, end) or list of these, optional
+        Quiet stretches, as seconds since the start or ISO times; found by themselves by default.
+    seed : int
+        Of the null records.
+    nulls : int
+        Number of null records.
+    false_alarm_level : float
+        Share of records of the simulation itself in which anything may be found.
+    block, restart_gap : str or float
+        As for `gyrostab.diagnose.reduced.reduce_log`.
+    progress : Stage
+        Is told of the progress.
+
+    Returns
+    -------
+    Diagnosis
+        Verdict, mismatches, effects with their numbers and alternatives, what was not found, the model, the surfaces.
+
+    Raises
+    ------
+    SchemaError
+        When it is no regular log.
+    OptionError
+        When the record is too short, an option makes no sense, or recording and simulation do not fit together.
+
+    Examples
+    --------
+    >>> found = gyrostab.diagnose(gyrostab.open_log("run7.nc"))                                          # doctest: +SKIP
+    >>> found.verdict, [effect["name"] for effect in found.effects]                                      # doctest: +SKIP
+    ('explained', ['vibration_noise'])
+    """
+    begun = time.perf_counter()
+    check_log(log)
+    _check_options(nulls, false_alarm_level, seed)
+    given = simulation if simulation is None or isinstance(simulation, xr.Dataset | Model) else read_model(simulation)
+    if isinstance(given, xr.Dataset):
+        _check_alike(log, given)
+    reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
+    progress("calibrating", 0)
+    baseline = _baseline(reduced, given, quiet, restart_gap, progress)
+    records = _records(reduced, baseline, nulls, seed)
+    progress("comparing", 0)
+    null = null_scores(baseline, records())
+    found = locate(reduced, baseline, null, level=false_alarm_level)
+    progress("naming", 0)
+    naming = name_effects(reduced, baseline, records(), level=false_alarm_level / 2.0, seed=seed, progress=progress)
+    progress("fitting", 0)
+    own = given if isinstance(given, Model) else None
+    return _concluded(reduced, baseline, found, naming, null, level=false_alarm_level, own=own, begun=begun)
+
+
+def _check_options(nulls: int, level: float, seed: int) -> None:
+    if not 0.0 < level < 0.5:
+        raise OptionError(f"false_alarm_level={level!r}: give the share of false alarms, above 0 and below 0.5, for instance 0.01")
+    if nulls < _LEAST_NULLS:
+        raise OptionError(f"nulls={nulls!r}: fewer than {_LEAST_NULLS} records do not tell how often chance does as much; give 400")
+    if seed < 0:
+        raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
+
+
+def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:
+    """Raise `OptionError` unless the two logs have the same stamps and axes."""
+    check_log(simulated)
+    for what, one, other in (
+        ("sampling rate", *(f"{float(each.attrs['sampling_rate_hz']):.10g} Hz" for each in (simulated, log))),
+        ("number of samples", *(str(each.sizes["time"]) for each in (simulated, log))),
+        ("axes", *(", ".join(map(str, each["axis"].values)) for each in (simulated, log))),
+        ("start", *(f"{np.datetime64(first_stamp(each), 'ns')}" for each in (simulated, log))),
+    ):
+        if one != other:
+            raise OptionError(
+                f"the simulated log has another {what} ({one}) than the recording ({other}); simulate it on the recording's stamps: "
+                "gyrostab simulate MODEL.toml --like RECORDING, or give the model itself"
+            )
+
+
+def _baseline(reduced: xr.Dataset, given: xr.Dataset | Model | None, quiet: Any, restart_gap: Any, progress: Stage) -> xr.Dataset:
+    if given is None:
+        return calibrate(reduced, quiet=quiet)
+    if quiet is not None:
+        raise OptionError("quiet says what to calibrate on; with a simulation nothing is calibrated, so leave one of the two out")
+    if isinstance(given, xr.Dataset):
+        same = f"{reduced.attrs['block_samples']}samples"
+        return from_simulation(reduced, reduce_log(given, block=same, restart_gap=restart_gap, progress=progress))
+    return from_model(reduced, given)
+
+
+def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -> Callable[[], Iterable[xr.Dataset]]:
+    """The same null records as often as they are asked for: kept where they are small, drawn again where not."""
+
+    def draw() -> Iterable[xr.Dataset]:
+        return null_records(reduced, baseline, count=count, rng=np.random.default_rng(seed))
+
+    if count * reduced["power"].size * 3 * 8 > _KEPT:
+        return draw
+    kept: list[xr.Dataset] = []
+
+    def recall() -> Iterable[xr.Dataset]:
+        if not kept:
+            kept.extend(draw())
+        return kept
+
+    return recall
+
+
+def _concluded(
+    reduced: xr.Dataset,
+    baseline: xr.Dataset,
+    found: xr.Dataset,
+    naming: Naming,
+    null: NullScores,
+    *,
+    level: float,
+    own: Model | None,
+    begun: float,
+) -> Diagnosis:
+    """Fit what was named, see what it is worth and what is left, and put it all into one result."""
+    fitted = fit_claims(naming, baseline)
+    after = predicted(naming, baseline) if naming.claims else baseline
+    held = held_out(reduced, baseline, (lambda known: predicted(naming, baseline, known)) if naming.claims else baseline)
+    mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level))
+    mismatches += unknown_tables(naming, reduced, mismatches)
+    unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
+    content = {
+        "schema": SCHEMA,
+        "recording": recording_table(reduced),
+        "baseline": baseline_table(baseline),
+        "verdict": verdict(mismatches, naming.claims, unexplained),
+        "false_alarm_level": level,
+        "mismatches": mismatches,
+        "effects": effect_tables(fitted, reduced),
+        "unexplained": unexplained,
+        "not_found": limit_tables(limits(naming)),
+        "held_out": {name: held[name] for name in HELD_OUT},
+        "seconds": round(time.perf_counter() - begun, 3),
+    }
+    surfaces = surfaces_with_blocks(make_surfaces(reduced, baseline, after), reduced, baseline, after)
+    diagnosis = Diagnosis(plain(content), surfaces, model_tables(baseline, fitted, own))
+    check_diagnosis(diagnosis.content)
+    return diagnosis
+
+
+def quiet_span(text: str) -> tuple[float | str, float | str]:
+    """Read a quiet stretch as it is given on the command line.
+
+    Raises
+    ------
+    OptionError
+        When it has not two ends, or one of them is neither a time nor a length of time.
+
+    Examples
+    --------
+    >>> quiet_span("0s/30min"), quiet_span("2026-03-14T08:00/2026-03-14T08:30Z")
+    ((0.0, 1800.0), ('2026-03-14T08:00', '2026-03-14T08:30'))
+    """
+    parts = [part.strip() for part in text.split("/")]
+    if len(parts) != 2 or not all(parts):
+        raise OptionError(f"quiet {text!r}: write START/END, for instance 2026-03-14T08:00/2026-03-14T08:30 or 0s/30min after the start")
+    ends = [_end(part, text) for part in parts]
+    return ends[0], ends[1]
+
+
+def _end(part: str, text: str) -> float | str:
+    try:
+        return (
+            str(np.datetime64(part.removesuffix("Z"))) if "-" in part else 0.0 if part in ("0", "0s") else duration_seconds(part, "quiet")
+        )
+    except ValueError as error:
+        raise OptionError(
+            f"quiet {text!r}: {part!r} is neither a time (2026-03-14T08:00) nor a length of time since the start (30min)"
+        ) from error
