@@ -53,6 +53,7 @@ class Accumulator:
         self.neighbours = np.full((self.axes, blocks), np.nan)
         self.pairs = [(a, b) for a, b in combinations(range(rows), 2) if a < self.axes]
         self.cross = np.full((len(self.pairs), blocks, bands), np.nan + 0j)
+        self.cross_shape = np.full(self.cross.shape, np.nan)
         self.line_sum = np.zeros((self.axes, PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, PARTS, 2))
@@ -110,8 +111,10 @@ class Accumulator:
             cross = kernel.band_powers(spectra[a], spectra[b], tables[a], places[a], self.edges, self.rate)
             differ = (both != counts[a]) | (both != counts[b])
             differ &= used[a] & used[b]
+            self.cross_shape[number, part] = self.shape[a, part]
             if differ.any():
-                cross[differ] = self._jointly(centred[[a, b]][:, differ], (present[a] & present[b])[differ])
+                both_there = (present[a] & present[b])[differ]
+                cross[differ], self.cross_shape[number, part][differ] = self._jointly(centred[[a, b]][:, differ], both_there)
             cross[~(used[a] & used[b])] = np.nan
             cross[both < max(_POWER_SHARE * self.length, 2)] = np.nan
             self.cross[number, part] = cross
@@ -149,17 +152,19 @@ class Accumulator:
             middle = expected.mean(axis=1)
             self.line_counts[row, piece] += [middle.sum(), (middle**2).sum()]
 
-    def _jointly(self, centred: Array, present: NDArray[np.bool_]) -> NDArray[np.complex128]:
-        """Cross-periodogram of blocks over the samples that both signals have."""
+    def _jointly(self, centred: Array, present: NDArray[np.bool_]) -> tuple[NDArray[np.complex128], Array]:
+        """Cross-periodogram of blocks over the samples that both signals have, and the shape that powers of these would have."""
         out = np.full((present.shape[0], self.edges.size - 1), np.nan + 0j)
+        shape = np.full(out.shape, np.nan)
         enough = present.sum(axis=-1) >= max(_POWER_SHARE * self.length, 2)
         if enough.any():
             present, centred = present[enough], centred[:, enough]
             centred = np.where(present, centred - (centred * present).sum(-1, keepdims=True) / present.sum(-1)[:, None], 0.0)
             one, other = np.fft.rfft(centred * self.weights, axis=-1)[..., 1 : kernel.ordinates(self.length) + 1]
-            expected = kernel.gap_spectra(present, self.weights)[0]
+            expected, mask, squared = kernel.gap_spectra(present, self.weights)
             out[enough] = kernel.band_powers(one, other, expected, np.arange(present.shape[0]), self.edges, self.rate)
-        return out
+            shape[enough] = kernel.shape_of_bands(mask, squared, expected, present.sum(axis=-1), self.edges, self.length)
+        return out, shape
 
     def _find_gaps(self, part: slice, present: NDArray[np.bool_]) -> None:
         """List the long stretches in which no axis has a sample."""

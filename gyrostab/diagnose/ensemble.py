@@ -206,7 +206,10 @@ def _cross(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[np.
     one = [names.index(str(name)) for name in frame.reduced["first"].values]
     other = [names.index(str(name)) for name in frame.reduced["second"].values]
     size = np.sqrt(power[:, one] * power[:, other])
-    cross = size * _coherency(np.minimum(frame.shape[one], frame.shape[other]), size.shape, rng)
+    shape = np.minimum(frame.shape[one], frame.shape[other])
+    if "cross_shape" in frame.reduced:
+        shape = _ordered(frame.reduced, "cross_shape", "pair", "block", "band")
+    cross = size * _coherency(shape, size.shape, rng)
     cross[..., np.isnan(_ordered(frame.reduced, "cross", "pair", "block", "band"))] = np.nan
     return np.asarray(cross)
 

@@ -96,9 +96,9 @@ def reduce_log(log: xr.Dataset, *, block: Any = None, restart_gap: Any = 5.0, pr
     xarray.Dataset
         By ``(axis, block)``: ``mean`` [degree hour-1], ``samples``, ``neighbours``, ``kurtosis``, ``outliers``, ``repeats``, ``extremes``,
         ``zeros``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution.
-        ``cross(pair, block, band)``, ``witness_power``, ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``,
-        ``order(axis, block, harmonic)``, ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``, and the gaps and
-        restarts in seconds. Coordinates ``time`` and ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
+        ``cross``, ``cross_shape`` (pair, block, band), ``witness_power``, ``witness_cross``, ``line_power(axis, part, line)``,
+        ``line_weight``, ``order(axis, block, harmonic)``, ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``,
+        and the gaps and restarts in seconds. Coordinates ``time`` and ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
     ------
@@ -182,6 +182,8 @@ def _beside(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     own = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
     attrs = _named("mean cross-periodogram of the samples that both axes have, two-sided density", _POWER)
     found["cross"] = (("pair", "block", "band"), work.cross[own], attrs)
+    attrs = _named("shape of the gamma distribution of powers over the samples that both axes have", "1")
+    found["cross_shape"] = (("pair", "block", "band"), work.cross_shape[own], attrs)
     found["first"] = ("pair", np.array([names[work.pairs[number][0]] for number in own], dtype=object))
     found["second"] = ("pair", np.array([names[work.pairs[number][1]] for number in own], dtype=object))
     if work.beside:

@@ -1,0 +1,144 @@
+"""Null records against raw logs that were simulated sample by sample and reduced."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline import calibrate, from_model
+from gyrostab.diagnose.ensemble import null_records
+from gyrostab.diagnose.gain import mean_gains, power_gains
+from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.simulate import simulate
+
+NOISE = {"Q": 0.05, "N": 0.003, "B": 0.004, "K": 0.02}
+RECORDS = 30
+
+
+def raw(seed: int, lost: float, *, axes: str = "x", lattice: float = 0.0) -> xr.Dataset:
+    """One hour at 10 Hz with the same gaps for every seed."""
+    effect = [{"name": "rate_quantization", "step": lattice}] if lattice else []
+    log = simulate({"log": {"axes": list(axes)}, "noise": NOISE, "effect": effect}, duration="1h", rate=10.0, seed=seed).compute()
+    gone = np.random.default_rng(7).random((len(axes), log.sizes["time"])) < lost
+    gone[:, 9000 : 9000 + int(4000 * lost)] = True
+    log["rate"] = log["rate"].where(xr.DataArray(~gone, dims=("axis", "time"))).assign_attrs(log["rate"].attrs)
+    return reduce_log(log)
+
+
+def joined(records: list[xr.Dataset]) -> xr.Dataset:
+    return xr.concat(records, "record", data_vars="minimal", coords="minimal", compat="override", join="override")
+
+
+@functools.cache
+def both(lost: float) -> tuple[xr.Dataset, xr.Dataset]:
+    """Raw records, and null records with the same noise, known exactly."""
+    records = [raw(seed, lost, axes="xy") for seed in range(RECORDS)]
+    baseline = from_model(records[0], {"noise": NOISE})
+    nulls = joined(list(null_records(records[0], baseline, count=160, rng=np.random.default_rng(3))))
+    names = [name for name in nulls.data_vars if "record" in nulls[name].dims]
+    return xr.concat([one[names] for one in records], "record", coords="minimal", compat="override", join="override"), nulls
+
+
+def close(one: xr.DataArray, other: xr.DataArray, *, rel: float) -> None:
+    """Means and standard deviations agree within `rel` of the standard deviation."""
+    scale = float(other.std())
+    assert abs(float(one.mean() - other.mean())) < rel * scale
+    assert float(one.std()) == pytest.approx(scale, rel=rel)
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_statistics_are_those_of_raw_logs(lost):
+    found, nulls = both(lost)
+    for name in ("power", "mean", "cross", "line_power", "kurtosis"):
+        np.testing.assert_array_equal(np.isnan(found[name].isel(record=0)), np.isnan(nulls[name].isel(record=0)))
+    for band in (0, 4, -1):
+        close(found["power"].isel(band=band), nulls["power"].isel(band=band), rel=0.06)
+        close(np.abs(found["cross"].isel(band=band)) ** 2, np.abs(nulls["cross"].isel(band=band)) ** 2, rel=0.12)
+    share = found["power"] / nulls["power"].mean(["record", "axis", "block"])
+    other = nulls["power"] / nulls["power"].mean(["record", "axis", "block"])
+    close(share.isel(band=slice(-4, None)).mean("band"), other.isel(band=slice(-4, None)).mean("band"), rel=0.06)
+    close(found["mean"].diff("block"), nulls["mean"].diff("block"), rel=0.05)
+    drift = [
+        one["mean"].isel(block=slice(60, 90)).mean("block") - one["mean"].isel(block=slice(0, 20)).mean("block") for one in (found, nulls)
+    ]
+    close(*drift, rel=0.35)
+    close(found["kurtosis"], nulls["kurtosis"], rel=0.1)
+    close(found["line_power"].max("line"), nulls["line_power"].max("line"), rel=0.15)
+    assert set(np.unique(nulls["extremes"].sum("block"))) == {2}
+    assert int(nulls["outliers"].max()) == 0
+
+
+def test_lattices_give_repeats_zeros_and_extremes():
+    record = raw(1, 0.0, lattice=0.5)
+    nulls = joined(list(null_records(record, calibrate(record), count=50, rng=np.random.default_rng(1))))
+    for name, scatter in (("repeats", 4.0), ("zeros", 4.0)):
+        many = float(nulls[name].sum("block").mean())
+        assert float(record[name].sum()) == pytest.approx(many, abs=scatter * np.sqrt(many))
+    extremes = nulls["extremes"].sum("block")
+    assert int(extremes.min()) >= 2
+    assert int(extremes.max()) > 2
+
+
+def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
+    rng = np.random.default_rng(2)
+    seconds = np.arange(36_000) / 10.0
+
+    def made(seed: int) -> xr.Dataset:
+        log = simulate({"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=seed).compute()
+        log["ramp"] = ("time", (seconds * 0.3) % 1.0, {"units": "1"})
+        log["rotation_rate"] = ("time", np.full(seconds.size, 360.0 * 0.7), {"units": "degree s-1"})
+        log["accel_x"] = ("time", rng.standard_normal(seconds.size), {"units": "g"})
+        return reduce_log(log)
+
+    records = [made(seed) for seed in range(6)]
+    nulls = joined(list(null_records(records[0], from_model(records[0], {"noise": {"N": 0.003}}), count=50, rng=np.random.default_rng(1))))
+    for name, rel in (("order", 0.08), ("profile", 0.05), ("witness_cross", 0.1)):
+        found = np.concatenate([np.abs(one[name].values.ravel()) ** 2 for one in records])
+        other = np.abs(nulls[name].values) ** 2
+        assert np.nanmean(found) == pytest.approx(np.nanmean(other), rel=rel), name
+
+
+def test_the_same_generator_gives_the_same_records():
+    record = raw(1, 0.3)
+    baseline = calibrate(record)
+    one, other = (next(null_records(record, baseline, count=2, rng=np.random.default_rng(5))) for _ in range(2))
+    xr.testing.assert_identical(one, other)
+
+
+def candidates(record: xr.Dataset) -> tuple[dict, dict]:
+    n, bands = record.sizes["block"], record.sizes["band"]
+    t, x = np.arange(n) / n, np.linspace(0.0, 1.0, bands)
+    knots = np.stack([np.interp(t, np.linspace(0, 1, 9), one) for one in np.eye(9)], axis=1)
+    event = ((t > 0.4) & (t < 0.5)).astype(float)
+    means = {"step": [(t > edge).astype(float) for edge in np.arange(0.1, 0.95, 0.1)], "trend": [t], "event": [event], "any": [knots]}
+    flat = np.ones((n, bands))
+    powers = {
+        "trend": [t[:, None] * flat],
+        "event": [event[:, None] * flat],
+        "filter": [-(x**4) * flat],
+        "band": [np.exp(-0.5 * ((x - place) / 0.07) ** 2) * event[:, None] for place in (0.5, 0.7, 0.9)],
+        "any": [knots[:, None, :] * flat[..., None]],
+    }
+    return means, powers
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_largest_gains_of_raw_logs_are_those_of_their_own_null_records(lost):
+    """The whole way: the rank of each raw record among null records of its own calibration is uniform."""
+    count, records = 29, 16
+    ranks = {"mean": [], "power": []}
+    for seed in range(records):
+        record = raw(100 + seed, lost)
+        baseline = calibrate(record)
+        nulls = joined(list(null_records(record, baseline, count=count, rng=np.random.default_rng(seed))))
+        means, powers = candidates(record)
+        for view, gains, tried in (("mean", mean_gains, means), ("power", power_gains, powers)):
+            own = float(gains(record, baseline, tried, axis="x").max())
+            ranks[view].append(int((gains(nulls, baseline, tried, axis="x").max("candidate") >= own).sum()))
+    for view, found in ranks.items():
+        share = (np.array(found) + 0.5) / (count + 1)
+        assert share.mean() == pytest.approx(0.5, abs=3.5 * np.sqrt(1.0 / 12.0 / records)), view
+        assert (share < 0.1).sum() <= 6, view  # 1 in 2000 for a binomial of 16 and 0.1
