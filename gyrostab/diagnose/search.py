@@ -151,6 +151,8 @@ def _means(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
 
 def _cells(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray, rng: np.random.Generator | None) -> list[Found]:
     rows = view_rows(group[0], state)
+    if not rows:  # pairs of a single axis
+        return []
     factors = []
     spread = 1
     for row in range(len(rows)):
