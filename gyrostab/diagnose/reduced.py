@@ -98,7 +98,7 @@ def reduce_log(log: xr.Dataset, *, block: Any = None, restart_gap: Any = 5.0, pr
         ``zeros``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution.
         ``cross``, ``cross_shape`` (pair, block, band), ``witness_power``, ``witness_cross``, ``line_power(axis, part, line)``,
         ``line_weight``, ``order(axis, block, harmonic)``, ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``,
-        and the gaps and restarts in seconds. Coordinates ``time`` and ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
+        and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
     ------
