@@ -209,17 +209,18 @@ class _Tables:
         #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp has no scatter of its own.
         self.own_dof = np.vstack([2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)])
         self.ks = ks.astype(np.float64)
-        self.quantile = _quantile_curve()
+        self.quantile = _quantile_curve(0.05)
+        self.unlikely = _quantile_curve(_MISFIT)
 
 
-def _quantile_curve() -> tuple[float, float, NDArray[np.float64]]:
-    """Lower 5 % point q of chi-square over its degrees of freedom nu, as `interpolate_quantile` reads it: start, step, ``nu ln q``.
+def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
+    """Lower point q at `level` of chi-square over its degrees of freedom nu, as `interpolate_quantile` reads it: start, step, ``nu ln q``.
 
     A step of 0.02 in ln nu leaves an error below 1e-9 of q.
     """
-    start, step = np.log(0.01), 0.02
+    start, step = np.log(0.01 * np.log(level) / np.log(0.05)), 0.02  # where the quantile is still a number above zero
     freedom = np.exp(start + step * np.arange(int(np.log(1e15) / step)))
-    return float(start), step, np.asarray(freedom * np.log(gammaincinv(freedom / 2.0, 0.05) * 2.0 / freedom))
+    return float(start), step, np.asarray(freedom * np.log(gammaincinv(freedom / 2.0, level) * 2.0 / freedom))
 
 
 @lru_cache(maxsize=4)
@@ -249,8 +250,9 @@ def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -
         visible = np.isfinite(square) & (field["separation"] > _SEPARATION)
         observed = visible & (square > 0) & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
         limit = np.minimum(_limit_of_estimate(field, tables), _limit_of_cell(flat, square, dof, tables))
-        limit[fails] = _limit_of_curve([cell[fails] for cell in flat], square[fails], dof[fails], tables)
-        observed &= ~fails[:, None] | (square <= limit)
+        failing = [cell[fails] for cell in flat], square[fails], dof[fails], tables
+        limit[fails] = _limit_of_curve(*failing, tables.quantile)
+        observed[fails] &= square[fails] <= _limit_of_curve(*failing, tables.unlikely)
         upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
         stderr = np.where(fails[:, None] & ~observed, np.fmax(stderr, (upper - value) / _LIMIT), stderr)
     stderr = np.where(visible, stderr, np.nan)
@@ -295,9 +297,13 @@ def _limit_of_cell(
 
 
 def _limit_of_curve(
-    flat: list[NDArray[np.float64]], square: NDArray[np.float64], dof: NDArray[np.float64], tables: _Tables
+    flat: list[NDArray[np.float64]],
+    square: NDArray[np.float64],
+    dof: NDArray[np.float64],
+    tables: _Tables,
+    quantile: tuple[float, float, NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """95 % upper limit of a squared coefficient that needs no model: its part of the curve cannot be more than the whole.
+    """Upper limit of a squared coefficient that needs no model: its part of the curve cannot be more than the whole.
 
     What else is in a cell, noise or not, only adds to it. What takes away is a filter, or an alias that looks like a
     filtered noise, and that bends the curve at short averaging times; so the cells are those of the last decade.
@@ -306,7 +312,7 @@ def _limit_of_curve(
     span = np.array([np.inf, *[_DECADE] * (len(TERMS) - 1)])
     own_dof = np.vstack([tables.own_dof[:STOCHASTIC], tables.own_dof[:STOCHASTIC].min(axis=0)])
     square = np.ascontiguousarray(square)
-    return np.asarray(cell_limits(*flat, square, dof, tables.columns, own_dof, tables.ks, span, _MOST_FREEDOM, *tables.quantile))
+    return np.asarray(cell_limits(*flat, square, dof, tables.columns, own_dof, tables.ks, span, _MOST_FREEDOM, *quantile))
 
 
 def _assemble(

@@ -336,7 +336,7 @@ def test_windows_are_fitted_alike_alone_and_together():
 
 @pytest.fixture(scope="module")
 def quantile_curve():
-    return fit._quantile_curve()
+    return fit._quantile_curve(0.05)
 
 
 @settings(deadline=None)
