@@ -31,7 +31,7 @@ __all__ = [
 Array = NDArray[Any]
 #: Where an effect can show, in the order in which they are looked at.
 VIEWS = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander")
-_MOST_VALUES, _MOST_VARIANTS = 60, 100
+_MOST_VALUES, _MOST_VARIANTS = 60, 200
 _LEAST_SHARE = 0.5  # of the blocks in which a channel must have data
 _TWINS = {"fringe_hop": "bias_jump"}  # the same design: the size decides
 _SAME = 1e-3  # designs that differ by less of their size are one

@@ -33,6 +33,7 @@ FORM = 0.01
 _ROW = 2.0  # nats that an axis must bring to be named with the others
 _ROUNDS = 10
 _LEAST_NULLS = 40
+_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
 _TAIL = 0.25
 
 
@@ -262,6 +263,8 @@ class _Search:
 
     def _counted(self, one: Claim | Unknown) -> set[str]:
         """Keys that stand for counts which are explained now: there is nothing to take out of a count."""
+        if any(part.candidate.effect in ("logger_filter", "~S(f)") for part in one.parts):
+            return {"~outliers"}  # the kurtosis of a block is that of other noise
         if not any(part.candidate.view == "marks" for part in one.parts):
             return set()
         marks = {mark for part in one.parts for mark in part.candidate.marks} | {"kurtosis"}
@@ -289,6 +292,8 @@ class _Search:
         need = {key: self.threshold + _form_error(several, chosen) for key, several in parts.items()}
         ranked = sorted(parts, key=lambda key: -_sum(parts[key]))
         passing = [key for key in ranked if _sum(parts[key]) > need[key]]
+        odd = [key for key in passing if parts[key][0].candidate.view == "marks" and not key.startswith("~")]
+        passing = odd or passing  # odd samples first: they raise powers and means too, and not the other way round
         if not passing:
             return None
         top = _sum(parts[passing[0]])
@@ -373,8 +378,10 @@ class _Search:
         kept, withdrawn = list(claims), []
         for axis in state.axes:
             named = [one for one in kept if any(part.candidate.view == "mean" and part.row == (axis,) for part in one.parts)]
-            if any(one.generic in ("~bias(t)", "~red") and axis in one.axes for one in unknown):
+            if any(one.generic in ("~bias(t)", "~S(f)", "~cov") and axis in one.axes for one in unknown):
                 continue
+            if any(part.candidate.effect in _SHAPES and axis in part.row for one in kept for part in one.parts):
+                continue  # the white variance of the means is not what the calibration took it for
             red = redness(state, axis, self.folds)
             strength = sum(one.gain for one in named)
             if red <= (2.0 + FORM * strength if named else self.threshold):

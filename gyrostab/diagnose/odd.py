@@ -14,6 +14,7 @@ __all__ = ["line_size", "mark_sizes"]
 
 _REACH = 3
 _PER_SPIKE = 3.0  # second differences that hold a spike
+_LIMIT = 6.0  # standard deviations beyond which one counts as an outlier
 Pair = tuple[float, float]
 
 
@@ -53,10 +54,8 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
     spread = _spread(reduced, row)
     error = math.sqrt(count + usual)
     if effect == "spikes":
-        chance = count / _PER_SPIKE / samples
-        excess = max(float(np.nanmean(reduced["kurtosis"].sel(axis=axis))), 0.0)
-        size = spread * (excess / (3.0 * chance)) ** 0.25
-        return {"per_hour": (count / _PER_SPIKE / hours, error / _PER_SPIKE / hours), "size": (size, 0.3 * size)}
+        seen, size = _outlier(count / samples, spread, max(float(np.nanmean(reduced["kurtosis"].sel(axis=axis))), 1e-3))
+        return {"per_hour": (count / seen / hours, error / seen / hours + 0.2 * count / seen / hours), "size": (size, 0.3 * size)}
     if effect == "held_samples":
         return {"per_hour": (count / hours, error / hours), "length": (1.0 / rate, 0.5 / rate)}
     share = min(count / samples, 0.999)
@@ -68,6 +67,20 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
         width = spread * float(norm.ppf(0.5 + share / 2.0))
         return {"width": (width, spread / (2.0 * float(norm.pdf(width / spread))) * error / samples)}
     return {}
+
+
+def _outlier(share: float, spread: float, excess: float) -> Pair:
+    """Second differences that an outlier drives beyond the limit, on average, and its rms size, from their share and the kurtosis."""
+    from scipy.special import erfc
+
+    limit = _LIMIT * math.sqrt(6.0) * spread
+    seen = _PER_SPIKE
+    size = spread
+    for _ in range(30):
+        size = spread * (excess * seen / (3.0 * share)) ** 0.25
+        seen = float(erfc(limit / (2.0 * size) / math.sqrt(2.0)) + 2.0 * erfc(limit / size / math.sqrt(2.0)))
+        seen = max(seen, 0.05)
+    return seen, size
 
 
 def _spread(reduced: xr.Dataset, row: int) -> float:

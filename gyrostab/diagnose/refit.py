@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, begin_state, pair_rows
 from gyrostab.diagnose.explained import Part, explain_away, mean_columns
-from gyrostab.diagnose.name import Claim, Naming
+from gyrostab.diagnose.name import AMBIGUOUS, Claim, Naming
 from gyrostab.diagnose.odd import line_size, mark_sizes
 from gyrostab.diagnose.sizes import Mixture, mean_mixture, part_mixture
 from gyrostab.errors import GyrostabError
@@ -191,7 +191,7 @@ def _within(value: Any, low: float, high: float) -> Any:
 
 def _estimate(mean: float, sd: float, unit: str, *, positive: bool) -> Estimate:
     """With the error of the form in it."""
-    total = math.hypot(sd, FORM_ERROR * mean)
+    total = math.hypot(sd, FORM_ERROR * mean) if sd > 0.0 else 0.0  # what is counted, not measured, is exact
     low, high = mean - _TWO_SIDED * total, mean + _TWO_SIDED * total
     return Estimate(mean, total, max(low, 0.0) if positive else low, high, unit)
 
@@ -211,6 +211,8 @@ def _mixture(part: Part, state: State, naming: Naming) -> tuple[Mixture, dict[st
     """Sizes over the nuisance grid, and the nuisance parameters themselves (mean and standard deviation)."""
     family = _family(part, naming)
     several = [part_mixture(part, state, variant) for variant in family]
+    usual = _usual(part, family, [float(np.logaddexp.reduce(one.log_weight)) for one in several])
+    family, several = [family[place] for place in usual], [several[place] for place in usual]
     merged = Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
     share = np.exp([np.logaddexp.reduce(one.log_weight) for one in several] - np.logaddexp.reduce(merged.log_weight))
     nuisance = {}
@@ -221,6 +223,18 @@ def _mixture(part: Part, state: State, naming: Naming) -> tuple[Mixture, dict[st
         mean = float(share @ grid)
         nuisance[name] = (mean, math.sqrt(max(float(share @ (grid - mean) ** 2), (0.3 * _spacing(grid, mean)) ** 2)))
     return merged, nuisance
+
+
+def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
+    """Places of the variants with the default of every nuisance parameter that the grid has it of, unless others are clearly better."""
+    known = {item.name: item.default for item in effects()[part.candidate.effect].parameters()}
+    plain = [
+        place
+        for place, one in enumerate(family)
+        if all(value == known[name] for name, value in one.values.items() if any(other.values[name] == known[name] for other in family))
+    ]
+    top = max(evidence)
+    return plain if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS else list(range(len(family)))
 
 
 def _spacing(grid: Array, place: float) -> float:

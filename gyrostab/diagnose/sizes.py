@@ -75,7 +75,7 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     )
     prior = baseline["grid_prior" if tier == "free" else "grid_calibrated"].sel(axis=axis).values
     own = len(columns)
-    gram = products.gram + _RIDGE * np.eye(whole.shape[1]) * np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
+    gram = products.gram + _RIDGE * np.eye(whole.shape[1]) * (1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None])
     covariance = np.linalg.inv(gram)
     mean = np.einsum("gij,gj->gi", covariance, products.cross[:, :, 0])
     fitted = (mean * products.cross[:, :, 0]).sum(axis=1)

@@ -111,7 +111,8 @@ class LoggerFilter(Effect):
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Cutoffs and lengths about the log's rate."""
-        return {"cutoff": windows.rate * np.array([0.0, 0.1, 0.2, 0.4]), "length": np.array([0.0, 1.0, 2.0, 4.0]) / windows.rate}
+        cutoff = np.concatenate([[0.0], np.geomspace(0.05, 0.48, 11)])
+        return {"cutoff": windows.rate * cutoff, "length": np.array([0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0]) / windows.rate}
 
     def explain(self, windows: Windows) -> Prediction:
         """By what the spectrum of white noise is multiplied, for an instrument much faster than the log."""

@@ -1,0 +1,164 @@
+"""Names for simulated effects, and none for noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gyrostab.diagnose.explained import explain_away
+from gyrostab.diagnose.folds import FOLDS, fold_blocks, fold_subsets
+from gyrostab.diagnose.name import Claim, name_effects, tail_level
+from gyrostab.diagnose.search import together
+from gyrostab.diagnose.surrogates import beats_slides
+from gyrostab.diagnose.tallies import count_gains, expected_counts, line_gains
+from gyrostab.errors import OptionError
+from tests.named import WORLD, nulls, record
+
+
+def named(effects, *, environment=WORLD["usual"], seed=1, drop=(), count=80):
+    reduced = record(effects, environment=environment, seed=seed, drop=drop)
+    baseline, records = nulls(reduced, count)
+    return name_effects(reduced, baseline, records)
+
+
+VIBRATION = [{"name": "vibration_noise", "white": 6e-4, "axes": ["x"]}]
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    return named(VIBRATION)
+
+
+def test_noise_gets_no_name():
+    found = named([], seed=2)
+    assert found.verdict == "no mismatch"
+    assert found.claims == found.unknown == ()
+    assert 3.0 < found.threshold < 15.0
+    assert found.null_best.size == 80
+
+
+def test_vibration_noise_is_named_on_its_axis(shaken):
+    (claim,) = shaken.claims
+    assert claim.effect == "vibration_noise"
+    assert claim.axes == ("x",)
+    assert claim.driver == ("vibration",)
+    assert claim.gain > claim.threshold >= shaken.threshold
+    assert claim.surrogate_p <= 0.01
+    assert "temperature_noise" not in claim.alternatives
+    assert shaken.verdict == "explained"
+
+
+@pytest.mark.parametrize(
+    ("table", "environment", "others"),
+    [
+        ({"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}, "usual", {"g_sensitivity"}),
+        ({"name": "shupe", "sensitivity": 0.4, "axes": ["x"]}, "usual", {"temperature_bias", "thermal_hysteresis", "warm_up"}),
+        ({"name": "shared_source", "N": [0.0012, 0.0012, -0.0012], "axes": ["x", "y", "z"]}, "usual", set()),
+        ({"name": "spikes", "per_hour": 100.0, "kind": "outlier", "size": 30.0, "axes": ["z"]}, "usual", set()),
+        ({"name": "spectral_line", "amplitude": 0.25, "frequency": 2.345, "axes": ["x"]}, "usual", {"real_motion", "supply_bias"}),
+        ({"name": "rotation_line", "amplitude": 0.15, "axes": ["x"]}, "turning", set()),
+    ],
+    ids=lambda value: value["name"] if isinstance(value, dict) else None,
+)
+def test_single_effects_are_named(table, environment, others):
+    found = named([table], environment=WORLD[environment])
+    assert [claim.effect for claim in found.claims] == [table["name"]]
+    (claim,) = found.claims
+    assert claim.axes == tuple(table["axes"])
+    assert set(claim.alternatives) <= others
+
+
+def test_without_its_channel_an_effect_is_not_named():
+    found = named(VIBRATION, drop=("vibration",))
+    assert not found.claims
+    assert found.verdict == "unknown"
+    assert {one.generic for one in found.unknown} <= {"~N(t)", "~S(f)"}
+    assert all(one.axes == ("x",) for one in found.unknown)
+
+
+def test_two_effects_are_both_named():
+    found = named([*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}])
+    assert {(claim.effect, claim.axes) for claim in found.claims} == {("vibration_noise", ("x",)), ("vibration_rectification", ("y",))}
+
+
+def test_slid_channels_do_worse(shaken):
+    (claim,) = shaken.claims
+    start = replace(shaken.state, given={})
+    beats, p_value = beats_slides(claim.parts, start, shaken.folds)
+    assert beats
+    assert p_value <= 0.01
+    elsewhere = [replace(part, row=("z",)) for part in claim.parts]
+    assert not beats_slides(elsewhere, start, shaken.folds)[0]
+
+
+def test_what_is_named_is_taken_out_of_the_rest(shaken):
+    (claim,) = shaken.claims
+    loud = shaken.state.weight[0] / shaken.state.baseline["spectrum"].values[0]
+    vibration = shaken.state.reduced["channel_vibration"].values
+    assert loud[vibration > 4].mean() > 1.2
+    assert loud[vibration < 1].mean() == pytest.approx(1.0, abs=0.05)
+    again = explain_away(shaken.state, list(claim.parts))
+    np.testing.assert_allclose(again.weight, shaken.state.weight, rtol=1e-3)
+
+
+def test_too_few_null_records_are_refused():
+    reduced = record([])
+    baseline, records = nulls(reduced, 20)
+    with pytest.raises(OptionError, match="20 null records are too few"):
+        name_effects(reduced, baseline, records)
+
+
+def test_claims_of_the_same_seed_are_the_same(shaken):
+    again = named(VIBRATION)
+    assert again.threshold == shaken.threshold
+    assert [claim.gain for claim in again.claims] == [claim.gain for claim in shaken.claims]
+    assert all(isinstance(claim, Claim) for claim in again.claims)
+
+
+# ---------------------------------------------------------------------------------------------------------------- parts
+
+
+def test_other_axes_must_pay_for_themselves():
+    assert together(np.array([10.0, 1.0, -5.0])) == 10.0
+    assert together(np.array([10.0, 10.0, 10.0])) == 27.0
+    assert together(np.array([-2.0, -1.0])) == -1.0
+
+
+def test_level_of_an_exponential_tail():
+    sample = np.random.default_rng(2).exponential(size=50_000)
+    for level in (0.1, 0.01, 0.001):
+        assert tail_level(sample, level) == pytest.approx(-np.log(level), rel=0.05)
+
+
+def subsets(blocks: int) -> np.ndarray:
+    return fold_subsets(fold_blocks(record([]).isel(block=slice(0, blocks))))
+
+
+def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
+    rng = np.random.default_rng(4)
+    usual = rng.poisson(0.05, (500, 2, 120))
+    mean, spread = expected_counts(usual)
+    np.testing.assert_allclose(mean, 0.05, rtol=0.05)
+    np.testing.assert_allclose(spread, 1.0, atol=0.2)
+    null = count_gains(usual, mean, spread, subsets(120))
+    raised = count_gains(rng.poisson(0.3, (50, 2, 120)), mean, spread, subsets(120))
+    assert np.quantile(null, 0.99) < 3.0
+    assert raised.min() > 5.0
+
+
+def test_a_line_stands_out_at_its_place_only():
+    rng = np.random.default_rng(5)
+    weight = np.full((1, 8), 22.0)
+    power = rng.gamma(22.0, 1 / 22.0, (40, 1, 8, 500))
+    null = line_gains(power, weight).max(axis=-1)
+    power[:, :, :, 123] *= 2.0
+    found = line_gains(power, weight)
+    assert np.quantile(null, 0.95) < 4.0
+    assert (found.argmax(axis=-1) == 123).all()
+    assert found.max(axis=-1).min() > 10.0
+
+
+def test_folds_of_all_lengths_are_used():
+    assert len(subsets(120)) == 1 + 3 * FOLDS

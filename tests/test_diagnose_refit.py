@@ -1,0 +1,159 @@
+"""Sizes of named effects: unbiased, with intervals that hold the truth, also where the form is only nearly right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline import calibrate
+from gyrostab.diagnose.candidates import effect_candidates
+from gyrostab.diagnose.cells import begin_state
+from gyrostab.diagnose.ensemble import null_records
+from gyrostab.diagnose.explained import Part, explain_away
+from gyrostab.diagnose.folds import fold_blocks
+from gyrostab.diagnose.name import Claim, Naming, name_effects
+from gyrostab.diagnose.odd import line_size
+from gyrostab.diagnose.refit import FORM_ERROR, fit_claims, limits, predicted
+from gyrostab.simulate import simulate
+from tests.named import COEFFICIENT, nulls, record
+
+RECORDS = 60
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    reduced = record([])
+    return reduced, calibrate(reduced)
+
+
+def claimed(reduced: xr.Dataset, baseline: xr.Dataset, effect: str, view: str, columns: tuple[str, ...]) -> Naming:
+    """A naming of one effect on the first axis."""
+    candidates, reasons = effect_candidates(reduced, COEFFICIENT)
+    one = next(one for one in candidates if one.effect == effect and one.view == view)
+    variant = next(variant for variant in one.variants if variant.columns == columns)
+    part = Part(one, variant, ("x",), 50.0)
+    claim = Claim(effect, one.driver, ("x",), (part,), 50.0, 8.0)
+    state = explain_away(begin_state(reduced, baseline), [part])
+    return Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced))
+
+
+def fits(quiet, change, effect, view, columns):
+    """Fits of many records of noise to which `change` adds an effect."""
+    reduced, baseline = quiet
+    drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
+    out = []
+    frame = claimed(reduced, baseline, effect, view, columns)
+    for number in range(RECORDS):
+        one = reduced.assign(
+            mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
+            power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
+        )
+        state = explain_away(begin_state(change(one), baseline), list(frame.claims[0].parts))
+        (fitted,) = fit_claims(replace(frame, state=state), baseline)
+        out.append(fitted.parameters[columns[0]])
+    return out
+
+
+def coverage(estimates, truth: float) -> float:
+    return float(np.mean([one.low <= truth <= one.high for one in estimates]))
+
+
+@pytest.mark.parametrize(("size", "power"), [(0.1, 2.0), (0.5, 2.0), (0.5, 1.9)])
+def test_intervals_of_rectification_hold_the_truth(quiet, size, power):
+    g = quiet[0]["channel_vibration"].values
+    truth = size / 36.0
+
+    def change(one):
+        return one.assign(mean=one["mean"] + xr.DataArray(size * (g / 6.0) ** power, dims="block"))
+
+    found = fits(quiet, change, "vibration_rectification", "mean", ("sensitivity",))
+    assert 0.90 <= coverage(found, truth) <= 1.0
+    assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=FORM_ERROR)
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_intervals_of_vibration_noise_hold_the_truth(quiet, share):
+    g = quiet[0]["channel_vibration"].values
+    truth = 0.003 * np.sqrt(share) / 6.0
+
+    def change(one):
+        return one.assign(power=one["power"] * xr.DataArray(1.0 + share * (g / 6.0) ** 2, dims="block"))
+
+    found = fits(quiet, change, "vibration_noise", "power", ("white",))
+    assert 0.88 <= coverage(found, truth) <= 1.0
+    assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=0.06)
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    reduced = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])
+    baseline, records = nulls(reduced)
+    return name_effects(reduced, baseline, records), baseline
+
+
+def test_the_model_has_the_effect(shaken):
+    naming, baseline = shaken
+    (fitted,) = fit_claims(naming, baseline)
+    one = fitted.parameters["sensitivity"]
+    assert one.low < 0.005 < one.high
+    assert one.unit == "deg/h/g^2"
+    assert fitted.effect is not None
+    assert fitted.effect.axes == ("y",)
+    assert "rectified" in fitted.say()
+    table = {"name": fitted.effect.name, "sensitivity": fitted.effect.sensitivity, "axes": list(fitted.effect.axes)}
+    again = record([table])["mean"].sel(axis="y") - record([])["mean"].sel(axis="y")
+    truth = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])["mean"].sel(axis="y") - record([])[
+        "mean"
+    ].sel(axis="y")
+    np.testing.assert_allclose(again, truth, atol=0.25 * float(np.abs(truth).max()))
+
+
+def test_the_prediction_fits_only_what_it_may_see(shaken):
+    naming, baseline = shaken
+    after = predicted(naming, baseline)
+    vibration = naming.state.reduced["channel_vibration"].values
+    gained = (after["known_mean"] - baseline["known_mean"]).sel(axis="y").values
+    assert np.ptp(gained) == pytest.approx(0.005 * np.max(vibration**2), rel=0.35)
+    assert np.allclose((after["known_mean"] - baseline["known_mean"]).sel(axis="x"), 0.0)
+    blind = predicted(naming, baseline, vibration < 1.0)
+    changed = replace(naming, state=replace(naming.state, reduced=naming.state.reduced.assign(
+        mean=naming.state.reduced["mean"] + xr.DataArray(np.where(vibration < 1.0, 0.0, 5.0), dims="block")
+    )))  # fmt: skip
+    np.testing.assert_allclose(predicted(changed, baseline, vibration < 1.0)["known_mean"], blind["known_mean"])
+
+
+def test_what_was_not_found_has_a_limit_or_a_reason(shaken):
+    naming, _ = shaken
+    found = limits(naming)
+    assert "vibration_rectification" not in found
+    assert found["shupe"].reason == "below limit"
+    assert 0.0 < found["shupe"].upper_limit < 5.0
+    assert found["shupe"].unit == "deg/h/(degC/min)"
+    assert 0.0 < found["vibration_noise"].upper_limit < 1e-3
+    assert np.isnan(found["feedback_reset"].upper_limit)
+    assert found["feedback_reset"].reason.startswith("not identifiable")
+
+
+def test_size_of_a_line():
+    table = {"name": "spectral_line", "amplitude": 0.4, "frequency": 2.345, "axes": ["x"]}
+    reduced = record([table])
+    power = reduced["line_power"].sel(axis="x").mean("part")
+    place = int(power.values.argmax())
+    (amplitude, error), (frequency, _) = line_size(reduced, "x", place)
+    assert amplitude == pytest.approx(0.4, abs=max(4 * error, 0.04))
+    assert frequency == pytest.approx(2.345, abs=0.03)
+
+
+def test_simulation_of_named_effects_runs(shaken):
+    naming, baseline = shaken
+    (fitted,) = fit_claims(naming, baseline)
+    values = {item.name: getattr(fitted.effect, item.name) for item in fitted.effect.parameters()}
+    log = simulate(
+        {"noise": {"N": 0.003}, "effect": [{"name": fitted.effect.name, "axes": ["y"], **values}],
+         "environment": [{"profile": "vibration", "points": [[0, 0.0], [30, 6.0]]}], "log": {"axes": ["x", "y"]}},
+        duration="1min", rate=10.0,
+    )  # fmt: skip
+    assert np.isfinite(log["rate"].values).all()
