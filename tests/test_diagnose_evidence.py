@@ -41,7 +41,7 @@ def test_without_effects_nothing_is_gained_and_the_simulation_fits():
     assert result["log_likelihood_gain"] == 0.0
     assert result["forecast_gain"] == 0.0
     assert result["misfit_before"] == result["misfit_after"]
-    assert result["blocks"] == 12
+    assert result["blocks"] == 36
     several = [held_out(found, base, base) for _, found in map(_record, (11, 12, 13))]
     assert np.mean([one["misfit_before"] for one in several]) == pytest.approx(1.0, abs=0.06)
     assert 0.94 < np.mean([one["coverage95_before"] for one in several]) < 0.96
@@ -135,7 +135,7 @@ def test_models_never_see_what_they_are_judged_on():
 def test_a_sham_effect_fitted_to_noise_loses():
     """An effect whose size is fitted to the rest of the record gains nothing on held-out time where it is not there."""
     gains = []
-    for seed in range(12):
+    for seed in range(8):
         base, found = _record(100 + seed)
         template = np.sin(np.arange(180) / 9.0)
 

@@ -19,8 +19,9 @@ __all__ = ["Trained", "held_out", "log_likelihoods", "stretches"]
 
 #: A baseline, or what fits one to the blocks where its argument, a mask of blocks, is true.
 Trained = xr.Dataset | Callable[[NDArray[np.bool_]], xr.Dataset]
-_STRETCH_S = 350.0
-_STRETCHES = (12, 40)
+_STRETCH_S, _FEWEST = 100.0, 36  # length of a stretch, and how many there must be: long ones would hide an event whole
+_LEAST = 12
+_GROUPS = 10  # of stretches of a fold, at most: what is told of the scatter comes from these
 _KNOWN = 0.7  # share of the record that a forecast begins from
 _SHORT = 5  # blocks
 _INSIDE = 1.959964  # standard deviations that hold 95 %
@@ -45,11 +46,11 @@ def held_out(reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain:
     Returns
     -------
     dict
-        ``blocks``, the stretches; ``log_likelihood_gain`` of `after` over `before` and its ``stderr`` from the scatter of the
+        ``blocks``, the stretches; ``log_likelihood_gain`` of `after` over `before` and its ``stderr`` from the scatter of groups of
         stretches [nats]; ``misfit_before``, ``misfit_after``, the mean square of the scores of the Allan variance, 1 for a model that
         fits, and ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band; ``mean_misfit_before`` and
-        ``mean_misfit_after``, the same of the means of the stretches; ``forecast_gain``, the gain on the last 30 % of models fitted to
-        the first 70 % [nats].
+        ``mean_misfit_after``, the same of the means of the stretches; ``forecast_gain``, the gain on the last 30 % of models fitted
+        to the first 70 % [nats].
 
     Raises
     ------
@@ -64,47 +65,51 @@ def held_out(reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain:
     """
     cut = stretches(reduced)
     count = cut.first.size
-    gain = np.zeros(count)
+    gains: list[Array] = []
     squares: dict[str, list[Array]] = {name: [] for name in ("before", "after", "mean_before", "mean_after")}
     fold = np.arange(count) % FOLDS
     for number in range(FOLDS):
         mine = np.flatnonzero(fold == number)
         known = _without(cut, mine, reduced.sizes["block"])
         held = Windows(cut.first[mine], cut.stop[mine])
+        group = np.arange(mine.size) * min(_GROUPS, mine.size) // mine.size
+        gains.append(np.zeros(int(group[-1]) + 1))
         for name, model, sign in (("after", after, 1.0), ("before", before, -1.0)):
             baseline = _trained(model, known)
-            gain[mine] += sign * log_likelihoods(reduced, baseline, known, held)
+            gains[-1] += sign * log_likelihoods(reduced, baseline, known, held, group)
             squares[name].append(_allan_scores(reduced, baseline, held))
             squares[f"mean_{name}"].append(_mean_scores(reduced, baseline, held))
+    gain = np.concatenate(gains)
     return {
         "blocks": count,
         "log_likelihood_gain": float(gain.sum()) + more_gain,
-        "stderr": float(np.sqrt(count) * gain.std(ddof=1)),
+        "stderr": float(np.sqrt(gain.size) * gain.std(ddof=1)),
         **_misfits(squares),
         "forecast_gain": _forecast(reduced, before, after),
     }
 
 
 def stretches(reduced: xr.Dataset) -> Windows:
-    """The stretches that are held out: some 350 s long, at least 12 of them, at most 40.
+    """The stretches that are held out: 100 s long, shorter in records of less than an hour.
 
     Raises
     ------
     OptionError
-        When there are fewer blocks than stretches.
+        When there are too few blocks.
     """
     blocks, span = reduced.sizes["block"], reduced.sizes["block"] * float(reduced.attrs["block_s"])
-    count = int(np.clip(round(span / _STRETCH_S), *_STRETCHES))
-    if blocks < count:
+    if blocks < _LEAST:
         raise OptionError(
-            f"the record has {blocks} blocks, too few to hold any out: it needs {count}; give a longer record or shorter blocks"
+            f"the record has {blocks} blocks, too few to hold any out: it needs {_LEAST}; give a longer record or shorter blocks"
         )
-    edge = np.rint(np.linspace(0, blocks, count + 1)).astype(np.int64)
+    edge = np.rint(np.linspace(0, blocks, min(blocks, max(_FEWEST, round(span / _STRETCH_S))) + 1)).astype(np.int64)
     return Windows(edge[:-1], edge[1:])
 
 
-def log_likelihoods(reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: Windows) -> Array:
-    """Log-likelihood of each held-out stretch given the known blocks [nats], up to a constant of the data.
+def log_likelihoods(
+    reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: Windows, group: NDArray[np.int64] | None = None
+) -> Array:
+    """Log-likelihood of held-out stretches given the known blocks [nats], up to a constant of the data.
 
     Parameters
     ----------
@@ -114,15 +119,24 @@ def log_likelihoods(reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np
         Blocks that a stretch is predicted from.
     held : Windows
         The stretches, none of whose blocks is known.
+    group : ndarray of int, optional
+        Group of each stretch, from 0; each is its own by default.
+
+    Returns
+    -------
+    ndarray (group,)
+        Joint log-likelihood of the stretches of each group.
     """
+    group = np.arange(held.first.size) if group is None else group
     total = np.concatenate([[0.0], np.cumsum(_power_terms(reduced, baseline) + _cross_terms(reduced, baseline))])
-    gained = total[held.stop] - total[held.first]
+    gained = np.bincount(group, total[held.stop] - total[held.first])
     for axis in range(reduced.sizes["axis"]):
         without = _mean_evidence(reduced, baseline, axis, known)
-        for place, (first, stop) in enumerate(zip(held.first, held.stop, strict=True)):
+        for number in range(gained.size):
             used = known.copy()
-            used[first:stop] = True
-            gained[place] += _mean_evidence(reduced, baseline, axis, used) - without
+            for place in np.flatnonzero(group == number):
+                used[held.first[place] : held.stop[place]] = True
+            gained[number] += _mean_evidence(reduced, baseline, axis, used) - without
     return np.asarray(gained)
 
 
@@ -203,7 +217,7 @@ def _mean_evidence(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, used: N
 def _allan_scores(reduced: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Array:
     """Squared scores of the Allan variance in windows that lie inside the held-out stretches, side by side."""
     first, stop = [held.first], [held.stop]
-    for length in (1, _SHORT):
+    for length in {1, min(_SHORT, int((held.stop - held.first).min()))}:
         inside = [np.arange(low, high - length + 1, length) for low, high in zip(held.first, held.stop, strict=True)]
         start = np.concatenate(inside)
         first.append(start)
