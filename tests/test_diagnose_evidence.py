@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.evidence import held_out, log_likelihoods, stretches
+from gyrostab.diagnose.evidence import held_out, log_likelihood, stretches
 from gyrostab.diagnose.surfaces import CASES, make_surfaces
-from gyrostab.diagnose.views.cells import Windows
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
 from tests.reduced_records import BLOCK_S, RATE, baseline, records
@@ -30,7 +29,7 @@ def _with_effects(base, *, epsilon=0.0, height=0.0):
     return after
 
 
-def _add_effects(found, rng, *, epsilon=0.0, height=0.0):
+def _add_effects(found, *, epsilon=0.0, height=0.0):
     found["power"][0, ON] *= 1.0 + epsilon
     found["mean"][1, ON] += height
 
@@ -51,14 +50,14 @@ def test_without_effects_nothing_is_gained_and_the_simulation_fits():
 def test_raised_noise_gains_what_the_gamma_law_says():
     base, found = _record(2)
     epsilon = 0.2
-    _add_effects(found, None, epsilon=epsilon)
+    _add_effects(found, epsilon=epsilon)
     result = held_out(found, base, _with_effects(base, epsilon=epsilon))
     shape = found["shape"].values[0, ON].sum()
     expected = shape * (epsilon - np.log1p(epsilon))
     scatter = np.sqrt(shape) * epsilon  # of sum n (P / S) epsilon / (1 + epsilon)
     assert result["log_likelihood_gain"] == pytest.approx(expected, abs=4.0 * scatter)
     assert result["log_likelihood_gain"] > 0.7 * expected
-    assert result["stderr"] > 0.2 * expected / 3.0  # all of it lies in a few stretches
+    assert result["stderr"] == pytest.approx(scatter, rel=0.25)
     assert result["misfit_before"] > result["misfit_after"] + 0.3
     assert result["coverage95_before"] < 0.93 < result["coverage95_after"] < 0.97
 
@@ -66,12 +65,23 @@ def test_raised_noise_gains_what_the_gamma_law_says():
 def test_a_mean_gains_what_the_normal_law_says():
     base, found = _record(3)
     height = 0.15
-    _add_effects(found, None, height=height)
+    _add_effects(found, height=height)
     result = held_out(found, base, _with_effects(base, height=height))
     expected = 0.5 * height**2 / VARIANCE * 30 * (1.0 - 30.0 / 180.0)
     assert result["log_likelihood_gain"] == pytest.approx(expected, rel=0.35)
     assert result["mean_misfit_before"] > 3.0 * result["mean_misfit_after"]
     assert result["misfit_after"] == pytest.approx(1.0, abs=0.12)
+
+
+def test_the_error_of_a_gain_is_its_scatter_over_records():
+    gains, errors = [], []
+    for seed in range(16):
+        base, found = _record(200 + seed)
+        _add_effects(found, epsilon=0.15, height=0.1)
+        result = held_out(found, base, _with_effects(base, epsilon=0.15, height=0.1))
+        gains.append(result["log_likelihood_gain"])
+        errors.append(result["stderr"])
+    assert 0.6 < np.std(gains, ddof=1) / np.mean(errors) < 1.6
 
 
 def test_held_out_means_have_the_density_of_dense_algebra():
@@ -80,8 +90,8 @@ def test_held_out_means_have_the_density_of_dense_algebra():
     known[40:52] = False
     known[100:110] = False  # held out by another stretch of the same fold
     twice = base.assign(mean_variance=base["mean_variance"] * 2.0)
-    held = Windows(np.array([40]), np.array([52]))
-    seen = log_likelihoods(found, twice, known, held)[0] - log_likelihoods(found, base, known, held)[0]
+    held = (np.arange(180) >= 40) & (np.arange(180) < 52)
+    seen = log_likelihood(found, twice, known, held) - log_likelihood(found, base, known, held)
     dense = 0.0
     for axis in range(3):
         y, rest = found["mean"].values[axis, 40:52], found["mean"].values[axis, known]
@@ -101,8 +111,7 @@ def test_cross_spectra_have_the_density_of_the_wishart_law():
     after["cross"] = (("pair", "block", "band"), np.full(found["cross"].shape, share * LEVEL + 0j))
     known = np.ones(180, dtype=bool)
     known[20:30] = False
-    held = Windows(np.array([20]), np.array([30]))
-    seen = log_likelihoods(found, after, known, held)[0] - log_likelihoods(found, base, known, held)[0]
+    seen = log_likelihood(found, after, known, ~known) - log_likelihood(found, base, known, ~known)
     model = LEVEL * np.array([[1.0, share], [share, 1.0]])
     expected = 0.0
     for block in range(20, 30):
@@ -163,7 +172,8 @@ def test_a_forecast_gains_where_the_effect_goes_on():
 
 def test_gain_of_other_views_is_added():
     base, found = _record()
-    assert held_out(found, base, base, more_gain=3.5)["log_likelihood_gain"] == 3.5
+    result = held_out(found, base, base, more_gain=3.5)
+    assert (result["log_likelihood_gain"], result["stderr"]) == (3.5, pytest.approx(np.sqrt(7.0)))
 
 
 def test_stretches_cover_the_record_once_and_short_records_are_refused():
@@ -189,7 +199,7 @@ def test_gaps_leave_the_coverage_as_it_is():
 
 def test_surfaces_stand_side_by_side():
     base, found = _record(9)
-    _add_effects(found, None, epsilon=0.5, height=0.4)
+    _add_effects(found, epsilon=0.5, height=0.4)
     surfaces = make_surfaces(found, base, _with_effects(base, epsilon=0.5, height=0.4))
     assert surfaces["case"].values.tolist() == list(CASES)
     assert surfaces["avar"].dims == ("case", "axis", "window", "tau")

@@ -15,13 +15,12 @@ from gyrostab.diagnose.views.davar import allan_surface
 from gyrostab.diagnose.views.mean import window_means
 from gyrostab.errors import OptionError
 
-__all__ = ["Trained", "held_out", "log_likelihoods", "stretches"]
+__all__ = ["Trained", "held_out", "log_likelihood", "stretches"]
 
 #: A baseline, or what fits one to the blocks where its argument, a mask of blocks, is true.
 Trained = xr.Dataset | Callable[[NDArray[np.bool_]], xr.Dataset]
 _STRETCH_S, _FEWEST = 100.0, 36  # length of a stretch, and how many there must be: long ones would hide an event whole
 _LEAST = 12
-_GROUPS = 10  # of stretches of a fold, at most: what is told of the scatter comes from these
 _KNOWN = 0.7  # share of the record that a forecast begins from
 _SHORT = 5  # blocks
 _INSIDE = 1.959964  # standard deviations that hold 95 %
@@ -46,8 +45,8 @@ def held_out(reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain:
     Returns
     -------
     dict
-        ``blocks``, the stretches; ``log_likelihood_gain`` of `after` over `before` and its ``stderr`` from the scatter of groups of
-        stretches [nats]; ``misfit_before``, ``misfit_after``, the mean square of the scores of the Allan variance, 1 for a model that
+        ``blocks``, the stretches; ``log_likelihood_gain`` of `after` over `before` and its ``stderr`` by the noise of the recording
+        [nats]; ``misfit_before``, ``misfit_after``, the mean square of the scores of the Allan variance, 1 for a model that
         fits, and ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band; ``mean_misfit_before`` and
         ``mean_misfit_after``, the same of the means of the stretches; ``forecast_gain``, the gain on the last 30 % of models fitted
         to the first 70 % [nats].
@@ -64,26 +63,23 @@ def held_out(reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain:
     (41.2, 6.0)
     """
     cut = stretches(reduced)
-    count = cut.first.size
-    gains: list[Array] = []
+    fold = np.arange(cut.first.size) % FOLDS
+    gain, variance = more_gain, 2.0 * abs(more_gain)
     squares: dict[str, list[Array]] = {name: [] for name in ("before", "after", "mean_before", "mean_after")}
-    fold = np.arange(count) % FOLDS
     for number in range(FOLDS):
-        mine = np.flatnonzero(fold == number)
-        known = _without(cut, mine, reduced.sizes["block"])
-        held = Windows(cut.first[mine], cut.stop[mine])
-        group = np.arange(mine.size) * min(_GROUPS, mine.size) // mine.size
-        gains.append(np.zeros(int(group[-1]) + 1))
-        for name, model, sign in (("after", after, 1.0), ("before", before, -1.0)):
-            baseline = _trained(model, known)
-            gains[-1] += sign * log_likelihoods(reduced, baseline, known, held, group)
+        held = Windows(cut.first[fold == number], cut.stop[fold == number])
+        out = _inside(held, reduced.sizes["block"])
+        models = {"before": _trained(before, ~out), "after": _trained(after, ~out)}
+        late, early = (log_likelihood(reduced, models[name], ~out, out) for name in ("after", "before"))
+        gain += late - early
+        variance += _variance(reduced, models["before"], models["after"], out, late - early)
+        for name, baseline in models.items():
             squares[name].append(_allan_scores(reduced, baseline, held))
             squares[f"mean_{name}"].append(_mean_scores(reduced, baseline, held))
-    gain = np.concatenate(gains)
     return {
-        "blocks": count,
-        "log_likelihood_gain": float(gain.sum()) + more_gain,
-        "stderr": float(np.sqrt(gain.size) * gain.std(ddof=1)),
+        "blocks": cut.first.size,
+        "log_likelihood_gain": float(gain),
+        "stderr": float(np.sqrt(variance)),
         **_misfits(squares),
         "forecast_gain": _forecast(reduced, before, after),
     }
@@ -106,49 +102,41 @@ def stretches(reduced: xr.Dataset) -> Windows:
     return Windows(edge[:-1], edge[1:])
 
 
-def log_likelihoods(
-    reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: Windows, group: NDArray[np.int64] | None = None
-) -> Array:
-    """Log-likelihood of held-out stretches given the known blocks [nats], up to a constant of the data.
+def log_likelihood(reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: NDArray[np.bool_]) -> float:
+    """Log-likelihood of held-out blocks given the known blocks [nats], up to a constant of the data.
 
     Parameters
     ----------
     reduced, baseline : xarray.Dataset
         The recording, and a model.
-    known : ndarray of bool (block,)
-        Blocks that a stretch is predicted from.
-    held : Windows
-        The stretches, none of whose blocks is known.
-    group : ndarray of int, optional
-        Group of each stretch, from 0; each is its own by default.
-
-    Returns
-    -------
-    ndarray (group,)
-        Joint log-likelihood of the stretches of each group.
+    known, held : ndarray of bool (block,)
+        Blocks that are predicted from, and those that are predicted.
     """
-    group = np.arange(held.first.size) if group is None else group
-    total = np.concatenate([[0.0], np.cumsum(_power_terms(reduced, baseline) + _cross_terms(reduced, baseline))])
-    gained = np.bincount(group, total[held.stop] - total[held.first])
+    total = float((_power_terms(reduced, baseline) + _cross_terms(reduced, baseline))[held].sum())
     for axis in range(reduced.sizes["axis"]):
-        without = _mean_evidence(reduced, baseline, axis, known)
-        for number in range(gained.size):
-            used = known.copy()
-            for place in np.flatnonzero(group == number):
-                used[held.first[place] : held.stop[place]] = True
-            gained[number] += _mean_evidence(reduced, baseline, axis, used) - without
-    return np.asarray(gained)
+        total += _mean_evidence(reduced, baseline, axis, known | held) - _mean_evidence(reduced, baseline, axis, known)
+    return total
 
 
 def _trained(model: Trained, known: NDArray[np.bool_]) -> xr.Dataset:
     return model if isinstance(model, xr.Dataset) else model(known)
 
 
-def _without(cut: Windows, held: NDArray[np.int64], blocks: int) -> NDArray[np.bool_]:
-    known = np.ones(blocks, dtype=bool)
-    for place in held:
-        known[cut.first[place] : cut.stop[place]] = False
-    return known
+def _inside(windows: Windows, blocks: int) -> NDArray[np.bool_]:
+    inside = np.zeros(blocks, dtype=bool)
+    for first, stop in zip(windows.first, windows.stop, strict=True):
+        inside[first:stop] = True
+    return inside
+
+
+def _variance(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_], gain: float) -> float:
+    """Variance of a gain: that of the powers from the scatter of their cells about `after`; a normal law has twice its gain."""
+    power, shape = (values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape"))
+    one, other = (values_of(baseline, "spectrum", "axis", "block", "band") for baseline in (after, before))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.square(shape * (1.0 / one - 1.0 / other) * (power - one))[:, held]
+    by_power = float((_power_terms(reduced, after) - _power_terms(reduced, before))[held].sum())
+    return float(terms[np.isfinite(terms)].sum()) + 2.0 * abs(gain - by_power)
 
 
 def _power_terms(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
@@ -248,8 +236,6 @@ def _misfits(squares: dict[str, list[Array]]) -> dict[str, float]:
 
 
 def _forecast(reduced: xr.Dataset, before: Trained, after: Trained) -> float:
-    blocks = reduced.sizes["block"]
-    known = np.arange(blocks) < round(_KNOWN * blocks)
-    rest = Windows(np.array([int(known.sum())]), np.array([blocks]))
-    late, early = (log_likelihoods(reduced, _trained(model, known), known, rest)[0] for model in (after, before))
-    return float(late - early)
+    known = np.arange(reduced.sizes["block"]) < round(_KNOWN * reduced.sizes["block"])
+    late, early = (log_likelihood(reduced, _trained(model, known), known, ~known) for model in (after, before))
+    return late - early
