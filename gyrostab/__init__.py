@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from gyrostab.correlate import correlation_rows as correlation_rows
     from gyrostab.davar import davar as davar
     from gyrostab.diagnose.core import diagnose as diagnose
-    from gyrostab.diagnose.result import Diagnosis as Diagnosis
     from gyrostab.diagnosis import open_diagnosis as open_diagnosis
     from gyrostab.diagnosis import write_diagnosis as write_diagnosis
     from gyrostab.export import open_log as open_log
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
 
 # public name -> module that holds it
 _HOME = {
-    "Diagnosis": "diagnose.result",
     "confidence_interval": "confidence",
     "correlate": "correlate",
     "correlation_rows": "correlate",
@@ -88,7 +86,6 @@ _HOME = {
 }
 
 __all__ = [
-    "Diagnosis",
     "__version__",
     "confidence_interval",
     "correlate",

@@ -19,7 +19,7 @@ from gyrostab.cli import app
 from gyrostab.export import open_log, open_product, open_surface
 from tests.command_line import N_TRUE, WINDOW, call, write_log
 
-COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "report", "plot", "export", "simulate")
+COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "report", "plot", "export", "simulate", "diagnose")
 
 
 @pytest.fixture(scope="module")
