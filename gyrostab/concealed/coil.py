@@ -1,0 +1,136 @@
+"""Heat in the fibre coil: a slab of layers between its outer face and an insulated spool, wound as a quadrupole."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+__all__ = ["coil_rate", "diffusion_time", "layer_temperatures", "layer_weights"]
+
+Array = NDArray[np.float64]
+
+DEG_PER_HOUR = math.degrees(1.0) * 3600.0  # rad/s -> deg/h
+
+
+def diffusion_time(thickness: float, diffusivity: float) -> float:
+    """Time constant [s] of the slowest mode of a slab of `thickness` [m] that is insulated on one face.
+
+    Examples
+    --------
+    >>> round(diffusion_time(0.012, 2.2e-7))
+    265
+    """
+    return 4.0 * thickness**2 / (math.pi**2 * diffusivity)
+
+
+def _step(layers: int, thickness: float, diffusivity: float, dt: float) -> tuple[Array, Array]:
+    """Crank-Nicolson matrices ``T' = P T + q (u + u') / 2`` of the layer temperatures T under the face temperature u."""
+    h = thickness / layers
+    a = diffusivity / h**2
+    rate = np.diag(np.full(layers - 1, a), 1) + np.diag(np.full(layers - 1, a), -1)
+    rate -= np.diag(rate.sum(axis=1))
+    rate[0, 0] -= 2 * a  # half a cell from the face
+    drive = np.zeros(layers)
+    drive[0] = 2 * a
+    left = np.linalg.inv(np.eye(layers) - dt / 2 * rate)
+    return left @ (np.eye(layers) + dt / 2 * rate), left @ drive * dt
+
+
+def layer_temperatures(face: Array, *, dt: float, layers: int = 24, thickness: float = 0.012, diffusivity: float = 2.2e-7) -> Array:
+    """Temperature of every layer [K] under the temperature of the outer face.
+
+    Parameters
+    ----------
+    face : ndarray, shape (time,)
+        Temperature of the outer face [K or degC], every `dt` seconds; the coil begins in balance with it.
+    dt : float
+        Step [s].
+    layers : int
+        Layers of fibre, from the face to the spool.
+    thickness : float
+        Thickness of the winding [m].
+    diffusivity : float
+        Thermal diffusivity of the potted winding [m2 s-1].
+
+    Returns
+    -------
+    ndarray, shape (layers, time)
+
+    Examples
+    --------
+    >>> after = layer_temperatures(np.r_[20.0, np.full(4000, 30.0)], dt=1.0)[:, -1]
+    >>> bool(np.allclose(after, 30.0, atol=0.01))
+    True
+    """
+    advance, drive = _step(layers, thickness, diffusivity, dt)
+    values, vectors = np.linalg.eigh(advance)  # symmetric, for the cells are equal
+    face = np.asarray(face, dtype=float)
+    push = np.zeros_like(face)
+    push[1:] = 0.5 * (face[1:] + face[:-1]) - face[0]
+    modes = np.stack([lfilter([1.0], [1.0, -value], weight * push) for value, weight in zip(values, vectors.T @ drive, strict=True)])
+    return np.asarray(vectors @ modes + face[0])
+
+
+def layer_weights(layers: int, *, length: float = 500.0, trim: float = 0.0, scatter: Array | None = None) -> Array:
+    """Weight ``integral of (L - 2 l) dl`` [m2] of each layer of a quadrupole winding.
+
+    Parameters
+    ----------
+    layers : int
+        Layers, a multiple of 4.
+    length : float
+        Length of the fibre [m].
+    trim : float
+        How far the middle of the fibre lies off the middle of the winding, as a share of the length.
+    scatter : ndarray, shape (layers,), optional
+        Error of each layer's length, as a share of it.
+
+    Examples
+    --------
+    >>> w = layer_weights(8)
+    >>> bool(abs(w.sum()) < 1e-9), bool(abs(w @ np.arange(8)) < 0.05 * abs(w) @ np.arange(8))  # uniform heating, a gradient
+    (True, True)
+    """
+    if layers % 4:
+        raise ValueError(f"a quadrupole has a multiple of 4 layers, not {layers}")
+    half = length / layers
+    lengths = np.full(layers, half) * (1.0 if scatter is None else 1.0 + scatter)
+    side = np.where(np.isin(np.arange(layers) % 4, (0, 3)), 1.0, -1.0)
+    weights = np.zeros(layers)
+    for sign in (1.0, -1.0):
+        mine = np.flatnonzero(side == sign)
+        ends = np.cumsum(lengths[mine])
+        begins = ends - lengths[mine]
+        weights[mine] = sign * (ends**2 - begins**2)  # (L - 2 l) integrated, l counted from the middle
+    return weights + 2.0 * trim * length * lengths
+
+
+def coil_rate(face: Array, *, dt: float, weights: Array, diameter: float = 0.04, length: float = 500.0, index: float = 1.45) -> Array:
+    """Apparent rotation rate [deg/h] of a coil whose outer face has the temperature `face` [degC] every `dt` [s].
+
+    Parameters
+    ----------
+    face : ndarray, shape (time,)
+        Temperature of the outer face [degC].
+    dt : float
+        Step [s].
+    weights : ndarray, shape (layers,)
+        From `layer_weights` [m2].
+    diameter, length : float
+        Of the coil and of its fibre [m].
+    index : float
+        Refractive index.
+
+    Examples
+    --------
+    >>> ramp = 20.0 + np.arange(3000) / 60.0  # 1 K/min
+    >>> rate = coil_rate(ramp, dt=1.0, weights=layer_weights(24, trim=1e-5))
+    >>> bool(abs(rate[-1] - rate[-500]) < 1e-3 * abs(rate[-1]))  # a steady ramp gives a steady error
+    True
+    """
+    speed = np.gradient(layer_temperatures(face, dt=dt, layers=weights.size), dt, axis=1)
+    strain = 8.6e-6 + index * 0.55e-6  # dn/dT + n alpha of silica [1/K]
+    return np.asarray(index / (diameter * length) * strain * (weights @ speed) * DEG_PER_HOUR)

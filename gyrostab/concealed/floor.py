@@ -1,0 +1,125 @@
+"""The noise that is always there: white, flicker, random walk and the steps of the angle, each by a method of this package's own."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.signal import lfilter
+
+__all__ = ["flicker", "floor_psd", "quantize_angle", "random_walk", "white_level"]
+
+Array = NDArray[np.float64]
+
+_URAD = math.degrees(1e-6) * 3600.0  # urad -> deg/h s
+
+
+def white_level(n: float) -> float:
+    """Root density [deg/h per root Hz] of an angle random walk `n` [deg/sqrt(h)].
+
+    Examples
+    --------
+    >>> white_level(0.003)
+    0.18
+    """
+    return 60.0 * n
+
+
+def floor_psd(frequency: Array, *, noise: dict[str, float], rate: float) -> Array:
+    """Two-sided density [(deg/h)2/Hz] of the noise Q [urad], N, B, K of a log of `rate` [Hz], at frequencies [Hz] above 0.
+
+    Examples
+    --------
+    >>> float(floor_psd(np.array([5.0]), noise={"N": 0.003}, rate=100.0)[0].round(6))
+    0.0324
+    """
+    f = np.asarray(frequency, dtype=float)
+    q = noise.get("Q", 0.0) * _URAD
+    return np.asarray(
+        white_level(noise.get("N", 0.0)) ** 2
+        + 4 * q**2 * rate * np.sin(math.pi * f / rate) ** 2
+        + noise.get("B", 0.0) ** 2 / (2 * math.pi * f)
+        + noise.get("K", 0.0) ** 2 / 3600.0 / (2 * math.pi * f) ** 2
+    )
+
+
+def flicker(rng: np.random.Generator, size: int, *, b: float, rate: float, method: str = "spectrum") -> Array:
+    """Bias instability `b` [deg/h]: from its spectrum, or as a sum of many relaxations.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    size : int
+        Samples.
+    b : float
+        Coefficient B [deg/h].
+    rate : float
+        Rate [Hz].
+    method : {"spectrum", "relaxations"}
+
+    Examples
+    --------
+    >>> flicker(np.random.default_rng(0), 1000, b=0.0, rate=10.0).std()
+    np.float64(0.0)
+    """
+    if b == 0:
+        return np.zeros(size)
+    if method == "spectrum":
+        length = fft.next_fast_len(2 * size, real=True)
+        f = fft.rfftfreq(length, 1 / rate)
+        f[0] = np.inf
+        level = np.sqrt(b**2 / (2 * math.pi * f) * rate * length / 2)
+        lines = (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)) * level
+        return np.asarray(fft.irfft(lines, length)[:size])
+    total = np.zeros(size)
+    slowest, fastest, per_decade = 4.0 * size / rate, 0.5 / rate, 3
+    times = np.geomspace(fastest, slowest, math.ceil(per_decade * math.log10(slowest / fastest)) + 1)
+    step = math.log(times[1] / times[0])
+    for tau in times:  # equal powers on a logarithmic scale of times make 1/f; one of them adds S = 2 s2 tau / (1 + (w tau)^2)
+        sd = math.sqrt(b**2 / (2 * math.pi) * 2 * step)
+        keep = math.exp(-1 / (rate * tau))
+        shocks = rng.standard_normal(size) * sd * math.sqrt(1 - keep**2)
+        shocks[0] = rng.standard_normal() * sd
+        total += lfilter([1.0], [1.0, -keep], shocks)
+    return total
+
+
+def random_walk(rng: np.random.Generator, size: int, *, k: float, rate: float) -> Array:
+    """Rate random walk `k` [deg/h^1.5], from 0.
+
+    Examples
+    --------
+    >>> steps = np.diff(random_walk(np.random.default_rng(0), 100_000, k=1.0, rate=1.0))
+    >>> round(float(steps.std() * 60), 1)
+    1.0
+    """
+    return np.asarray(np.cumsum(rng.standard_normal(size)) * k / math.sqrt(3600.0 * rate))
+
+
+def quantize_angle(values: Array, *, q: float, rate: float, first: float = 0.0) -> Array:
+    """Rates [deg/h] as an angle counter with noise `q` [urad] gives them: differences of whole steps.
+
+    Parameters
+    ----------
+    values : ndarray, shape (time,)
+        Rates [deg/h].
+    q : float
+        Coefficient Q [urad]: the step of the angle over root 12.
+    rate : float
+        Rate [Hz].
+    first : float
+        Where in its step the angle begins, 0 to 1.
+
+    Examples
+    --------
+    >>> out = quantize_angle(np.full(1000, 7.3), q=0.5, rate=10.0)
+    >>> len(set(out.round(6).tolist())), round(float(out.mean()), 1)
+    (2, 7.3)
+    """
+    if q == 0:
+        return np.asarray(values, dtype=float)
+    step = q * _URAD * math.sqrt(12.0)
+    angle = np.floor(np.cumsum(np.asarray(values, dtype=float) / rate) / step + first)
+    return np.asarray(np.diff(angle, prepend=math.floor(first)) * step * rate)

@@ -1,0 +1,69 @@
+"""The closed loop: a serrodyne ramp that falls back by 2 pi, the error of that step, and the dead zone by crosstalk."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["dead_zone", "ramp_phase", "reset_error", "reset_frequency"]
+
+Array = NDArray[np.float64]
+
+
+def reset_frequency(rate: Array, *, diameter: float = 0.04, index: float = 1.45, wavelength: float = 1.55e-6) -> Array:
+    """Resets of the ramp per second [Hz] at a rotation rate [deg/h]: ``D w / (n lambda)``.
+
+    Examples
+    --------
+    >>> round(float(reset_frequency(np.array(15.0))), 2)
+    1.29
+    """
+    return np.asarray(diameter * np.radians(np.asarray(rate) / 3600.0) / (index * wavelength))
+
+
+def ramp_phase(rate: Array, *, dt: float, first: float = 0.0, **coil: float) -> Array:
+    """Phase of the ramp, 0 to 1 from one reset to the next, under the rates [deg/h] every `dt` [s].
+
+    Examples
+    --------
+    >>> phase = ramp_phase(np.full(1000, 15.0), dt=0.01)
+    >>> int((np.diff(phase) < 0).sum())  # 10 s at 1.29 Hz
+    12
+    """
+    turned = first + np.cumsum(reset_frequency(rate, **coil)) * dt
+    return np.asarray(turned % 1.0)
+
+
+def reset_error(phase: Array, *, settle: float = 0.05) -> Array:
+    """Error of the rate after a reset by more or less than 2 pi, without unit, of mean zero.
+
+    Parameters
+    ----------
+    phase : ndarray
+        From `ramp_phase`.
+    settle : float
+        Share of the ramp in which the loop takes the error back.
+
+    Examples
+    --------
+    >>> error = reset_error(np.linspace(0, 1, 100_000, endpoint=False))
+    >>> bool(abs(error.mean()) < 1e-3), bool(error[0] > 0.9)
+    (True, True)
+    """
+    mean = settle * (1 - math.exp(-1 / settle))
+    return np.asarray(np.exp(-np.asarray(phase) / settle) - mean)
+
+
+def dead_zone(rate: Array, *, width: float) -> Array:
+    """What a loop gives whose crosstalk holds it at zero below `width` [deg/h], and pulls softly above.
+
+    Examples
+    --------
+    >>> dead_zone(np.array([0.1, -0.1, 10.0]), width=0.2).round(2).tolist()
+    [0.0, 0.0, 10.0]
+    """
+    rate = np.asarray(rate, dtype=float)
+    above = np.sqrt(np.maximum(rate**2 - width**2, 0.0))
+    return np.asarray(np.copysign(above, rate) + 0.0)

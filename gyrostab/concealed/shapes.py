@@ -1,0 +1,147 @@
+"""From a shape to an effect of a wanted strength: what the effects of this package share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.concealed.limits import NATS, amplitude_for, mean_size, variance_gain, variance_size
+from gyrostab.concealed.world import AXES, Effect, World
+
+__all__ = ["mean_effect", "on_axes", "projection", "variance_effect"]
+
+Array = NDArray[np.float64]
+
+
+def on_axes(rng: np.random.Generator, *, alone: float = 0.6) -> Array:
+    """Signed shares (axis,) of an effect: on one axis with probability `alone`, else on all, unequally."""
+    shares = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.4, 1.0, 3)
+    if rng.random() < alone:
+        keep = np.zeros(3)
+        keep[rng.integers(3)] = 1.0
+        shares *= keep
+    return np.asarray(shares / np.abs(shares).max())
+
+
+def named(shares: Array) -> tuple[str, ...]:
+    """Names of the axes that have a share."""
+    return tuple(axis for axis, share in zip(AXES, shares, strict=True) if share != 0)
+
+
+def projection(world: World, mean: Array, driver: Array, *, unit: str) -> dict[str, Any]:
+    """Sensitivity of a mean (time,) to a driver (time,) by least squares over the samples present: what a linear model should find."""
+    there = ~world.missing
+    x = driver[there] - driver[there].mean()
+    return {"value": float(x @ mean[there] / (x @ x)), "unit": unit}
+
+
+def mean_effect(
+    world: World,
+    shape: Array,
+    shares: Array,
+    *,
+    strength: float,
+    name: str,
+    driver: str | None,
+    form: str,
+    differs: bool,
+    tau: tuple[float, float] | None = None,
+    active: NDArray[np.bool_] | None = None,
+    regressor: tuple[str, Array, str] | None = None,
+    **more: Any,
+) -> Effect:
+    """An effect that adds ``shape * shares``, scaled to `strength`.
+
+    Parameters
+    ----------
+    world : World
+    shape : ndarray, shape (time,) or (axis, time)
+        Without unit; one for all axes, or one for each.
+    shares : ndarray, shape (axis,)
+        Signed shares of the axes.
+    strength : float
+        Size in units of the limit.
+    name, driver, form, differs, tau, active
+        See `Effect`.
+    regressor : (str, ndarray, str), optional
+        Name of a parameter, the driver it multiplies (time,) and its unit: its value is the projection of the mean.
+
+    Returns
+    -------
+    Effect
+    """
+    mean = np.asarray(shares[:, None] * (shape if shape.ndim == 2 else shape[None, :]))
+    mean *= strength / mean_size(world, mean)
+    parameters = dict(more.pop("parameters", {}))
+    parameters["peak"] = {"value": float(np.abs(mean - np.median(mean, axis=1, keepdims=True)).max()), "unit": "deg/h"}
+    parameters["size_white"] = {"value": mean_size(world, mean, white=True), "unit": "1"}
+    if regressor is not None:
+        first = int(np.argmax(np.abs(shares)))
+        parameters[regressor[0]] = projection(world, mean[first], regressor[1], unit=regressor[2]) | {"axis": AXES[first]}
+    return Effect(
+        name=name,
+        axes=named(shares),
+        driver=driver,
+        form=form,
+        differs=differs,
+        size=strength,
+        nats=NATS * strength**2,
+        tau=tau or (max(1.0, 2 / world.rate), world.seconds / 3),
+        active=active,
+        mean=mean,
+        parameters=parameters,
+        **more,
+    )
+
+
+def variance_effect(
+    world: World,
+    ratio: Callable[[float], Array],
+    *,
+    strength: float,
+    name: str,
+    axes: tuple[str, ...],
+    driver: str | None,
+    form: str,
+    differs: bool,
+    first: float,
+    tau: tuple[float, float] | None = None,
+    active: NDArray[np.bool_] | None = None,
+) -> tuple[Effect, float]:
+    """An effect on the noise density, and the amplitude that gives it `strength`.
+
+    Parameters
+    ----------
+    world : World
+    ratio : callable
+        Amplitude to density over density without effect, see `variance_size`; 1 at amplitude 0.
+    strength : float
+        Size in units of the limit.
+    first : float
+        A small amplitude.
+    name, axes, driver, form, differs, tau, active
+        See `Effect`.
+
+    Returns
+    -------
+    Effect, float
+    """
+    amplitude = amplitude_for(lambda a: variance_size(world, ratio(a)), strength, first=first)
+    final = ratio(amplitude)
+    effect = Effect(
+        name=name,
+        axes=axes,
+        driver=driver,
+        form=form,
+        differs=differs,
+        size=variance_size(world, final),
+        nats=variance_gain(world, final),
+        tau=tau or (1 / world.rate, 30.0),
+        active=active,
+        variance=final if final.ndim == 2 and final.shape[1] > 1 else None,
+        parameters={"ratio": {"value": float(np.abs(final - 1).max()), "unit": "1"}},
+    )
+    return effect, amplitude

@@ -1,0 +1,89 @@
+"""A drilling tool that turns, sticks and slips: its rotation, its toolface, and what earth and gravity make of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["EARTH_RATE", "cross_axis", "gravity", "rotation", "toolface"]
+
+Array = NDArray[np.float64]
+
+#: Rate of the earth [deg/h].
+EARTH_RATE = 15.041
+
+
+def rotation(rng: np.random.Generator, seconds: float, *, dt: float, fastest: float = 120.0, stick_slip: bool = True) -> Array:
+    """Rotation rate [deg/s] of a tool that drills, stands and drills again.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    seconds : float
+        Length [s].
+    dt : float
+        Step [s].
+    fastest : float
+        Highest speed [revolutions per minute]; below it lie `dt` and the rate of the log.
+    stick_slip : bool
+        Whether the rate swings at 0.1-0.5 Hz in some stretches.
+
+    Examples
+    --------
+    >>> w = rotation(np.random.default_rng(3), 900.0, dt=0.1)
+    >>> bool(w.min() >= 0), bool(w.max() > 30), bool((w == 0).any())
+    (True, True, True)
+    """
+    size = math.ceil(seconds / dt) + 1
+    t = np.arange(size) * dt
+    wanted = np.zeros(size)
+    begin = rng.uniform(0.05, 0.15) * seconds
+    while begin < 0.9 * seconds:
+        end = begin + rng.uniform(0.1, 0.35) * seconds
+        mean = rng.uniform(0.4, 1.0) * fastest * 6.0
+        inside = (t >= begin) & (t < end)
+        swing = rng.uniform(0.3, 0.95) if stick_slip and rng.random() < 0.5 else 0.0
+        beat = rng.uniform(0.1, 0.5)
+        drift = 1 + 0.02 * np.sin(2 * math.pi * t / rng.uniform(40, 200))
+        wanted[inside] = (mean / (1 + swing) * drift * (1 + swing * np.sin(2 * math.pi * beat * t)))[inside]
+        begin = end + rng.uniform(0.08, 0.25) * seconds
+    return wanted
+
+
+def toolface(rotation_rate: Array, *, dt: float, first: float = 0.0) -> Array:
+    """Angle of the tool about its axis [rad] under rotation rates [deg/s] every `dt` [s], by the trapezoid rule.
+
+    Examples
+    --------
+    >>> round(float(toolface(np.full(11, 36.0), dt=1.0)[-1] / math.pi), 6)  # a turn in 10 s
+    2.0
+    """
+    w = np.radians(rotation_rate)
+    return np.asarray(first + np.concatenate([[0.0], np.cumsum(0.5 * (w[1:] + w[:-1]) * dt)]))
+
+
+def cross_axis(angle: Array, *, across: float) -> tuple[Array, Array]:
+    """Parts of a vector of size `across` that stands still, seen by the turning axes x and y.
+
+    Examples
+    --------
+    >>> x, y = cross_axis(np.array([0.0, math.pi / 2]), across=10.0)
+    >>> x.round(6).tolist(), y.round(6).tolist()
+    ([10.0, 0.0], [-0.0, -10.0])
+    """
+    return np.asarray(across * np.cos(angle)), np.asarray(-across * np.sin(angle))
+
+
+def gravity(angle: Array, *, inclination: float) -> tuple[Array, Array, Array]:
+    """Gravity [g] along x, y, z of a tool whose axis lies `inclination` [deg] off the plumb line.
+
+    Examples
+    --------
+    >>> parts = gravity(np.array([0.7]), inclination=30.0)
+    >>> round(float(sum(p[0] ** 2 for p in parts)), 6)
+    1.0
+    """
+    x, y = cross_axis(angle, across=math.sin(math.radians(inclination)))
+    return x, y, np.full(np.shape(angle), math.cos(math.radians(inclination)))
