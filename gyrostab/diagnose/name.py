@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.candidates import Candidate, Variant, effect_candidates
 from gyrostab.diagnose.cells import State, begin_state
-from gyrostab.diagnose.explained import Part, explain_away
+from gyrostab.diagnose.explained import Part, explain_away, mean_columns
 from gyrostab.diagnose.folds import fold_blocks
 from gyrostab.diagnose.gain import mean_factors
 from gyrostab.diagnose.generics import generic_candidates
 from gyrostab.diagnose.search import Found, Tallies, gains, together, totals
+from gyrostab.diagnose.sizes import mean_mixture
 from gyrostab.diagnose.structure import allowed, structural
 from gyrostab.diagnose.surrogates import beats_slides
 from gyrostab.diagnose.tallies import Expected
 from gyrostab.errors import OptionError
+from gyrostab.noise import HOUR
 from gyrostab.progress import Stage, no_stage
 
 __all__ = ["Claim", "Naming", "Unknown", "name_effects", "tail_level"]
@@ -373,6 +375,16 @@ class _Search:
         fresh = tuple(replace(part, gain=_gain_of(mine.get(key, []), part)) for part in claim.parts)
         return replace(claim, gain=gain, alternatives=others, parts=fresh)
 
+    def _flexible(self, state: State, claims: Sequence[Claim], axis: str) -> State:
+        """The state with the next points of the nuisance grids beside those named: a time constant lies between two of them."""
+        row = state.axes.index(axis)
+        for part in (part for one in claims for part in one.parts if part.candidate.view == "mean" and part.row == (axis,)):
+            family = [one for one in part.candidate.variants if one.columns == part.variant.columns]
+            place = next(number for number, one in enumerate(family) if one is part.variant)
+            for other in family[max(place - 1, 0) : place] + family[place + 1 : place + 2]:
+                state = state.with_columns("mean", axis, mean_columns(other, row))
+        return state
+
     def _complete(self, state: State, claims: list[Claim], unknown: Sequence[Unknown]) -> tuple[list[Claim], list[Unknown]]:
         """Names are withdrawn where, with them in the model, the slow noise is still redder than calibrated."""
         kept, withdrawn = list(claims), []
@@ -382,11 +394,11 @@ class _Search:
                 continue
             if any(part.candidate.effect in _SHAPES and axis in part.row for one in kept for part in one.parts):
                 continue  # the white variance of the means is not what the calibration took it for
-            red = redness(state, axis, self.folds)
+            red = redness(self._flexible(state, named, axis), axis, self.folds)
             strength = sum(one.gain for one in named)
-            if red <= (2.0 + FORM * strength if named else self.threshold):
+            weak = [one for one in named if red > max(2.0 + FORM * strength, 0.1 * one.gain)]
+            if not weak and red <= self.threshold + FORM * strength:
                 continue
-            weak = [one for one in named if red > 0.1 * one.gain]
             names = tuple(one.effect for one in weak)
             kept = [one for one in kept if one not in weak]
             withdrawn.append(Unknown("~red", (axis,), red, self.threshold, names))
@@ -394,14 +406,20 @@ class _Search:
 
 
 def redness(state: State, axis: str, folds: xr.DataArray) -> float:
-    """What free random walk and flicker gain over the calibrated ones, with all that is named in the model [nats]."""
+    """What free random walk and flicker gain over the calibrated ones, with all that is named in the model [nats].
+
+    Zero where the noise is less red than calibrated: a calibration on blocks that an effect touches takes it for noise.
+    """
     given = state.given.get(("mean", axis))
     beside = np.stack(given, axis=-1) if given else None
-    both = [
-        mean_factors(state.reduced, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds)[0, 0, 0]
-        for tier in ("free", "calibrated")
-    ]
-    return float(both[0] - both[1])
+    columns = [np.linspace(-1.0, 1.0, state.reduced.sizes["block"])] if not given else []
+    evidence, strength = [], []
+    span = state.reduced.sizes["block"] * float(state.reduced.attrs["block_s"])
+    slow = state.baseline["grid_K"].sel(axis=axis).values ** 2 * span / HOUR + state.baseline["grid_B"].sel(axis=axis).values ** 2
+    for tier in ("free", "calibrated"):
+        evidence.append(mean_factors(state.reduced, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds)[0, 0, 0])
+        strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))
+    return float(evidence[0] - evidence[1]) if strength[0] > strength[1] else 0.0
 
 
 # ------------------------------------------------------------------------------------------------------------------ parts

@@ -63,7 +63,8 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     y = (state.reduced["mean"] - baseline["known_mean"]).transpose("axis", "block").values[row]
     whole = np.stack([*columns, *state.given.get(("mean", axis), [])], axis=1)
     present = np.isfinite(y)
-    size = np.maximum(np.abs(whole - whole.mean(axis=0)).max(axis=0), 1e-300)
+    size = np.abs(whole - whole.mean(axis=0)).max(axis=0)
+    size = np.where(size > 0.0, size, 1.0)
     grid = {"K": baseline["grid_K"].sel(axis=axis).values, "B": baseline["grid_B"].sel(axis=axis).values}
     products = mean_products(
         np.where(present, y, 0.0)[:, None],
