@@ -149,7 +149,7 @@ def drawn(cells: Cells, rng: np.random.Generator, count: int) -> Cells:
 def effective(density: Array, reduced: xr.Dataset) -> Array:
     """A density, (axis or 1, block or 1, band), as gaps let it be seen: mixed with its mean over frequency, (axis, block, band)."""
     near = reduced["neighbours"].values[..., None]
-    width = (reduced["band_high"] - reduced["band_low"]).values
+    width = reduced["band_high"].values - reduced["band_low"].values
     level = (density * width).sum(axis=-1, keepdims=True) / width.sum()
     return np.asarray(np.where(np.isfinite(near), near * density + (1.0 - near) * level, density))
 

@@ -42,6 +42,7 @@ from gyrostab.windows import duration_seconds
 __all__ = ["diagnose", "quiet_span"]
 
 _KEPT = 3e8  # bytes of null records that are kept rather than drawn twice
+_AT_ONCE = 6.4e7  # bytes of band powers of the null records that are scored together
 _LEAST_NULLS = 100
 
 
@@ -159,8 +160,10 @@ def _baseline(reduced: xr.Dataset, given: xr.Dataset | Model | None, quiet: Any,
 def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -> Callable[[], Iterable[xr.Dataset]]:
     """The same null records as often as they are asked for: kept where they are small, drawn again where not."""
 
+    together = int(np.clip(_AT_ONCE / (reduced["power"].size * 8), 25, count))
+
     def draw() -> Iterable[xr.Dataset]:
-        return null_records(reduced, baseline, count=count, rng=np.random.default_rng(seed))
+        return null_records(reduced, baseline, count=count, rng=np.random.default_rng(seed), chunk=together)
 
     if count * reduced["power"].size * 3 * 8 > _KEPT:
         return draw
