@@ -11,9 +11,11 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.account import spans
+from gyrostab.diagnose.account import _can_show, spans
+from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.content import chance_of_gain
 from gyrostab.diagnose.core import diagnose, quiet_span
+from gyrostab.diagnose.explained import Part
 from gyrostab.diagnose.result import check_diagnosis
 from gyrostab.diagnosis.files import FILES
 from gyrostab.errors import OptionError, SchemaError
@@ -185,6 +187,18 @@ def test_times_of_an_effect_are_few_or_the_whole_record():
     there[150:170] = True
     assert spans(there, begin, begin + 1.0) == [(50.0, 90.0), (150.0, 170.0)]
     assert spans(np.arange(200) % 12 < 3, begin, begin + 1.0) == [(0.0, 200.0)]
+
+
+def test_a_line_explains_a_line_at_its_own_frequency_only():
+    line = Part(Candidate("spectral_line", "line", (), ()), Variant({}, ("amplitude",), np.empty(0)), ("x",), 50.0, place=116)
+    reduced = xr.Dataset(coords={"line_frequency": ("line", np.arange(1, 400) * 0.25)})
+    box = {"view": "spectrum", "what": "line", "frequency": 29.25, "tau_min_s": 0.017, "tau_max_s": 0.017}
+    assert _can_show(line, box, reduced)
+    assert not _can_show(line, box | {"frequency": 12.5}, reduced)
+    assert not _can_show(line, box | {"what": "ramp phase", "frequency": np.nan}, reduced)
+    assert _can_show(line, {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 0.01, "tau_max_s": 0.02}, reduced)
+    assert not _can_show(line, {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0}, reduced)
+    assert not _can_show(line, {"view": "mean", "what": "mean", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0}, reduced)
 
 
 def test_the_chance_of_a_gain_goes_on_beyond_the_null_records():

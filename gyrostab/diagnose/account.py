@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.explained import Part
 from gyrostab.diagnose.name import Claim
 from gyrostab.diagnose.null_scores import NullScores, standardise
 from gyrostab.diagnose.views import VIEWS
@@ -33,6 +34,8 @@ _LEFT = 0.3  # of a mismatch, that an error of the form may leave
 _ACTS = 0.2  # of its largest, that a contribution counts as there
 _MEETS = 0.3  # of the shorter of effect and mismatch
 _MOST_SPANS = 6
+_BESIDE, _SHARP = 3, 0.02  # lines beside a strong one, and share of its frequency, that belong to it
+_BUMP, _WIDE = 0.371, 4.0
 
 
 def acting(claim: Claim, blocks: int) -> NDArray[np.bool_]:
@@ -109,12 +112,26 @@ def explanations(
         gone = _gone(box, scores, null, level)
         names = []
         for claim, its_time in zip(claims, when, strict=True):
-            views = {part.candidate.view for part in claim.parts if str(box["view"]) in _SHOWS.get(part.candidate.view, ())}
+            views = {part.candidate.view for part in claim.parts if _can_show(part, box, reduced)}
             near = any(_meet(box, span) for span in its_time) and set(str(box["axes"]).split()) & set(claim.axes)
             if views and near and (gone or not views <= set(_MODELLED)):
                 names.append(claim.effect)
         out.append(list(dict.fromkeys(names)))
     return out
+
+
+def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
+    """Whether a part of an effect can be seen where a mismatch is; a line explains a line at its own frequency only."""
+    if str(box["view"]) not in _SHOWS.get(part.candidate.view, ()):
+        return False
+    if part.candidate.view != "line" or part.place < 0 or box["view"] == "distribution":
+        return True
+    lines = reduced["line_frequency"].values
+    mine = float(lines[part.place])
+    if np.isfinite(box["frequency"]):
+        return bool(abs(box["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine)
+    tau = _BUMP / mine  # where the Allan variance of a sine is largest
+    return str(box["what"]) in ("avar", "level") and bool(box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE)
 
 
 def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:

@@ -64,7 +64,7 @@ def _boxes(panel: Axes, axis: str, content: Mapping[str, Any], size: float, *, t
     low_edge, high_edge = _log_edges(taus)[[0, -1]]
     left, right = panel.get_xlim()
     for box in content["mismatches"]:
-        if axis not in box["axes"] or box["view"] not in ("davar", "spectrum", "cross_axis") or not box["tau_min_s"]:
+        if axis not in box["axes"] or box["view"] not in ("davar", "cross_axis") or not box["tau_min_s"]:
             continue
         begin, end = _time_of(box["start"], start) / size, _time_of(box["end"], start) / size
         least = _LEAST_WIDTH * (right - left)
