@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.concealed import environment
 from gyrostab.concealed.catalogue import CATALOGUE, STRANGE, Entry
+from gyrostab.concealed.plan import STRENGTHS
 from gyrostab.concealed.record import channels_of, lost, make_log, signal
 from gyrostab.concealed.sever import sever
 from gyrostab.concealed.visible import is_buried
@@ -27,6 +28,9 @@ BLOCK = 10.0
 
 _TRIES = 40
 
+#: Tries to bury an effect before it is made weaker.
+_PATIENCE = 10
+
 
 def _suits(world: World, entries: Sequence[Entry]) -> bool:
     needs = {entry.needs for entry in entries}
@@ -39,15 +43,22 @@ def _world(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) -> Worl
     cuts = max([plan["cuts"], *(entry.cuts for entry in entries)])
     for trial in range(_TRIES):
         rng = stream(plan["seed"], "world", plan["index"], attempt, trial)
-        longest = 2000.0 if plan["kind"] == "buried" else 300.0
+        buried = plan["kind"] == "buried"
         world = draw_world(
-            rng, rate=plan["rate"], seconds=plan["seconds"], gaps=plan["gaps"], cuts=cuts, heavy=plan["heavy"], longest=longest
+            rng, rate=plan["rate"], seconds=plan["seconds"], gaps=plan["gaps"], cuts=cuts, heavy=plan["heavy"], buried=buried
         )
         if any(entry.needs == "dips" for entry in entries):
             world = replace(world, light=environment.light_monitor(rng, plan["seconds"], dips=True))
         if _suits(world, entries):
             return world
     raise OptionError(f"case {plan['index']} of seed {plan['seed']}: no environment with {plan['names']} in it was drawn in {_TRIES} tries")
+
+
+def _weaker(plan: dict[str, Any], attempt: int) -> dict[str, Any]:
+    """A plan whose effect would not be buried in many tries, one step weaker."""
+    if plan["kind"] != "buried" or attempt == 0 or attempt % _PATIENCE:
+        return plan
+    return plan | {"strengths": [max((s for s in STRENGTHS if s < strength), default=strength) for strength in plan["strengths"]]}
 
 
 def draw_effects(plan: dict[str, Any], world: World, *, attempt: int = 0) -> list[Effect]:
@@ -94,6 +105,7 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
     entries = [known[name] for name in plan["names"]]
     seed = int(stream(plan["seed"], "case", plan["index"]).integers(2**40))
     for attempt in range(_TRIES):
+        plan = _weaker(plan, attempt)
         world = _world(plan, entries, attempt)
         effects = draw_effects(plan, world, attempt=attempt)
         record = signal(world, effects, seed=seed + attempt)

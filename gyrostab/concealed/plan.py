@@ -107,7 +107,7 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
         "seconds": seconds,
         "gaps": float(rng.uniform(0.0, 0.4)) if rng.random() < 0.5 else 0.0,
         "cuts": int(rng.integers(1, 4)) if rng.random() < 0.3 else 0,
-        "heavy": bool(rng.random() < (0.5 if kind == "null" else 0.1)),
+        "heavy": bool(rng.random() < {"null": 0.5, "buried": 0.0}.get(kind, 0.1)),
         "severing": str(rng.choice(possible)) if kind == "severed" else None,
     }
 

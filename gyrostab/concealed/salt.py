@@ -46,7 +46,7 @@ def rough_noise(record: Array, *, rate: float) -> dict[str, float]:
 def _world_of(log: xr.Dataset, record: Array, rng: np.random.Generator) -> World:
     """The world of a real log: its own length, gaps, noise and temperature; what it does not tell is drawn."""
     rate = float(log.attrs["sampling_rate_hz"])
-    world = draw_world(rng, rate=rate, seconds=record.shape[1] / rate, cuts=0, longest=300.0)
+    world = draw_world(rng, rate=rate, seconds=record.shape[1] / rate, cuts=0)
     noise = [rough_noise(row, rate=rate) for row in record]
     noise += [noise[0]] * (3 - len(noise))
     gone = np.asarray(np.isnan(record).any(axis=0))

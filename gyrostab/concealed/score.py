@@ -93,8 +93,8 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
     -------
     list of dict
         A row for every true effect, or one row where there is none: ``kind``, ``effect``, ``strength``, ``detected``, ``named`` (classes
-        merged by the ambiguity sets), ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (claims that stand for nothing true), ``unknown``,
-        ``iou``, ``tau_hit``, ``covered``, ``gain``, ``oracle``, ``seconds``, ``claims`` and more.
+        merged by the ambiguity sets), ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (claims that stand for nothing true),
+        ``unknown``, ``iou``, ``tau_hit``, ``covered``, ``gain``, ``oracle``, ``seconds``, ``claims`` and more.
 
     Raises
     ------

@@ -39,6 +39,7 @@ def lose(rng: np.random.Generator, size: int, *, share: float, frame: int, burst
     if burst <= 1:
         bad = rng.random(frames) < share
     else:
+        burst = max(burst, share / (1 - share))  # at least one frame comes between two bursts
         count = max(1, math.ceil(2 * frames * share / burst) + 10)
         down = rng.geometric(1 / burst, count)
         up = rng.geometric(min(1.0, share / ((1 - share) * burst)), count)

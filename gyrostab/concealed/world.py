@@ -102,11 +102,13 @@ def per_second(world: World) -> NDArray[np.int64]:
     return np.bincount(at, minlength=world.temperature.size)
 
 
-def _noise(rng: np.random.Generator, rate: float, *, heavy: bool) -> tuple[dict[str, float], ...]:
+def _noise(rng: np.random.Generator, rate: float, *, heavy: bool, calm: bool) -> tuple[dict[str, float], ...]:
     base = {"N": 10 ** rng.uniform(-3.0, -2.0), "B": 10 ** rng.uniform(-3.0, -2.2), "K": 10 ** rng.uniform(-2.5, -1.3)}
     if heavy:
         base["K"] *= rng.uniform(3, 10)
         base["B"] *= rng.uniform(1, 4)
+    if calm:
+        base["K"] *= 0.2
     share = 0.0 if rng.random() < 0.5 else 10 ** rng.uniform(-2.5, -1.0)  # of the steps in the variance at the shortest time
     axes = []
     for _ in AXES:
@@ -129,7 +131,7 @@ def _missing(rng: np.random.Generator, size: int, rate: float, gaps: float, cuts
 
 
 def draw_world(
-    rng: np.random.Generator, *, rate: float, seconds: float, gaps: float = 0.0, cuts: int = 0, heavy: bool = False, longest: float = 600.0
+    rng: np.random.Generator, *, rate: float, seconds: float, gaps: float = 0.0, cuts: int = 0, heavy: bool = False, buried: bool = False
 ) -> World:
     """Draw what happens in one case.
 
@@ -146,8 +148,8 @@ def draw_world(
         Power cuts.
     heavy : bool
         Whether flicker and random walk are unusually strong.
-    longest : float
-        Longest burst of vibration [s].
+    buried : bool
+        Long bursts and little random walk, so that effects can be small for a long time.
 
     Examples
     --------
@@ -156,7 +158,7 @@ def draw_world(
     (6000, True)
     """
     size = round(seconds * rate)
-    vibration, busy = environment.shaking(rng, seconds, bursts=int(rng.integers(2, 5)), longest=longest)
+    vibration, busy = environment.shaking(rng, seconds, bursts=int(rng.integers(2, 5)), longest=2500.0 if buried else 300.0)
     fastest = min(rng.uniform(30, 120), 60.0 * rate / 8)
     turning = tool.rotation(rng, seconds, dt=QUICK, fastest=fastest) if rng.random() < 0.7 else np.zeros(math.ceil(seconds / QUICK) + 1)
     when = telemetry.power_cuts(rng, seconds, number=cuts) if cuts else np.zeros((0, 2))
@@ -165,7 +167,7 @@ def draw_world(
         rate=rate,
         size=size,
         start=(1_700_000_000 + day) * 10**9,
-        noise=_noise(rng, rate, heavy=heavy),
+        noise=_noise(rng, rate, heavy=heavy, calm=buried),
         temperature=environment.temperature(rng, seconds, still=bool(rng.random() < 0.1)),
         vibration=vibration,
         busy=busy,

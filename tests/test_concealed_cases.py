@@ -1,0 +1,285 @@
+"""Cases: repeatable, sized as they say, buried where they say so, and nothing of the truth in what is handed over."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.concealed import channel_detector, make_case, open_truth, plan_case, plan_cases, salt, seal
+from gyrostab.concealed.catalogue import CATALOGUE, STRANGE
+from gyrostab.concealed.limits import NATS, amplitude_for, mean_size, shared_size, variance_gain, variance_size
+from gyrostab.concealed.naive import allan_detector
+from gyrostab.concealed.record import signal
+from gyrostab.concealed.seal import truth_text
+from gyrostab.concealed.sever import sever
+from gyrostab.concealed.visible import FAINT
+from gyrostab.concealed.world import AXES, draw_world, stream
+from gyrostab.errors import FormatError, OptionError
+from gyrostab.export import open_log
+from gyrostab.regularise import gap_table
+from gyrostab.schema import check_log
+
+EVERY = CATALOGUE | STRANGE
+
+
+def small(name: str | None, *, seed: int = 21, strength: float = 3.0, rate: float = 10.0, seconds: float = 900, **more) -> dict:
+    names = [name] if name else []
+    base = plan_case(4, seed=seed) | {"kind": "single" if name else "null", "names": names, "strengths": [strength] * len(names)}
+    return base | {"rate": rate, "seconds": seconds, "gaps": 0.1, "severing": None} | more
+
+
+def white_world(*, rate: float = 10.0, seconds: float = 2000.0):
+    world = draw_world(np.random.default_rng(1), rate=rate, seconds=seconds)
+    noise = tuple({"N": n, "B": 0.0, "K": 0.0, "Q": 0.0} for n in (0.003, 0.004, 0.002))
+    return replace(world, noise=noise, missing=np.zeros(world.size, dtype=bool))
+
+
+def test_limit_of_a_mean_is_the_closed_form():
+    world = white_world()
+    mean = np.zeros((3, world.size))
+    mean[1, 5000:8000] = 1.0  # 300 s of 2000 s
+    effective = 300 * (1 - 300 / 2000)
+    smallest = 60 * 0.004 * math.sqrt(2 * NATS / effective)
+    assert mean_size(world, mean * smallest) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
+    world = replace(white_world(), noise=tuple({"N": 0.003, "B": 0.002, "K": 0.02, "Q": 0.0} for _ in AXES))
+    t = np.arange(world.size) / world.rate
+    mean = np.zeros((3, world.size))
+    mean[0] = np.cos(2 * math.pi * t / 700)
+    mean *= 2.0 / mean_size(world, mean)
+    red = mean_size(world, mean, white=True)
+    assert red > 2.05  # random walk hides a slow mean, so the same size takes more amplitude
+    from scipy import fft
+
+    from gyrostab.concealed.floor import floor_psd
+    from gyrostab.concealed.record import base_noise
+
+    f = np.arange(1, world.size) * world.rate / 2 / world.size
+    density = floor_psd(f, noise=world.noise[0], rate=world.rate) * world.rate
+    lines = fft.dct(mean[0], norm="ortho")[1:]
+    ratios = []
+    for seed in range(150):
+        noise = base_noise(world, np.random.default_rng(seed))[0]
+        ratios.append(float((lines * (fft.dct(noise, norm="ortho")[1:] + lines / 2) / density).sum()))
+    nats = NATS * 4.0
+    assert np.mean(ratios) == pytest.approx(nats, abs=4 * math.sqrt(2 * nats / 150))
+    assert np.var(ratios) == pytest.approx(2 * nats, rel=0.5)
+
+
+def test_limits_of_noise_are_the_closed_forms():
+    world = white_world()
+    n = world.size
+    step = np.ones((3, world.temperature.size))
+    step[0, :1000] = math.exp(2 * math.sqrt(NATS / n) * 2)  # half of the time: T_eff is a quarter of T
+    assert variance_size(world, step) == pytest.approx(1.0, rel=0.01)
+    always = np.full((3, 1, 10), 1.0)
+    always[1] = math.exp(2 * math.sqrt(NATS / n))
+    assert variance_size(world, always) == pytest.approx(1.0, rel=1e-6)
+    assert variance_gain(world, always) == pytest.approx(NATS, rel=0.05)
+    assert shared_size(world, np.array([math.sqrt(2 * NATS / n), 0, 0])) == pytest.approx(1.0)
+    assert amplitude_for(lambda a: a**1.5, 8.0) == pytest.approx(4.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_effect_makes_a_case_of_its_strength(name):
+    log, truth = make_case(small(name))
+    check_log(log)
+    (effect,) = truth["effects"]
+    assert effect["name"] == name
+    assert effect["size"] == pytest.approx(3.0, rel=0.01)
+    assert effect["expected_nats"] > 0.5 * NATS * 9
+    assert set(effect["axes"]) <= set(AXES)
+    assert 0 < effect["tau_min_s"] < effect["tau_max_s"]
+    assert all(begin < end for begin, end in effect["intervals"])
+    json.loads(truth_text(truth))
+    assert gap_table(log)["samples"].sum() == np.isnan(log.rate.values).all(axis=0).sum()
+    if EVERY[name].channel:
+        assert EVERY[name].channel in log
+
+
+def test_a_case_is_the_same_again_and_another_is_not():
+    plan = small("shupe")
+    (one, truth), (again, same) = make_case(plan), make_case(plan)
+    xr.testing.assert_identical(one, again)
+    assert truth_text(truth) == truth_text(same)
+    assert not np.array_equal(one.rate.values, make_case(plan | {"index": 5})[0].rate.values, equal_nan=True)
+
+
+def test_an_effect_on_the_mean_is_the_difference_to_the_bare_noise():
+    world = white_world(seconds=900)
+    effect = CATALOGUE["temperature_bias"].make(world, np.random.default_rng(0), strength=2.0)
+    both = signal(world, [effect], seed=3) - signal(world, [], seed=3)
+    np.testing.assert_allclose(both, effect.mean, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["vibration_noise", "aliased_vibration"])
+def test_shaking_adds_the_variance_that_its_size_was_reckoned_from(name):
+    world = white_world(rate=100.0, seconds=600)
+    effect = CATALOGUE[name].make(world, np.random.default_rng(2), strength=30.0)
+    row = int(np.argmax(np.abs(effect.extra).max(axis=1)))
+    sd = 60 * world.noise[row]["N"] * 10
+    busy = effect.extra[row] != 0
+    v = np.log1p(np.mean(effect.extra[row][busy] ** 2) / sd**2)
+    n = busy.sum() * (1 - busy.mean())
+    alone = math.sqrt(n * v**2 / 4 / NATS)
+    assert 0.3 < alone / effect.size < 1.1  # a flat density is the weakest of all of this power, and other axes may add
+
+
+def test_buried_cases_are_seen_by_neither_eye():
+    plan = small("spectral_line", kind="buried", seconds=3600, heavy=False, strength=1.5)
+    log, truth = make_case(plan)
+    assert truth["buried"]["buried"]
+    assert truth["effects"][0]["size"] <= 1.5
+    noise = truth["noise"][truth["effects"][0]["axes"][0]]["N"]
+    wave = truth["effects"][0]["parameters"]["peak"]["value"] / math.sqrt(2)
+    assert wave / (60 * noise) < FAINT * 1.01 / math.sqrt(0.5)  # a mean over 1 s can only be smaller than the line itself
+    assert truth["buried"]["sample"] < FAINT
+    assert truth["buried"]["second"] < FAINT
+    assert all(share < 1 for share in truth["buried"]["allan"].values())
+    assert not allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30)
+
+
+def test_a_loud_effect_is_never_called_buried():
+    from gyrostab.concealed.visible import is_buried
+
+    world = white_world(seconds=900)
+    effect = CATALOGUE["spectral_line"].make(world, np.random.default_rng(0), strength=30.0)
+    assert not is_buried(world, [effect], signal(world, [effect], seed=1), rng=np.random.default_rng(0))["buried"]
+
+
+def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
+    words = [*EVERY, "strength", "concealed", "buried", "severed", "withheld", "decoy", "truth", "effect", "seed", "sealed"]
+    plans = [small(name, index=i) for i, name in enumerate(EVERY)] + [small(None, index=90)]
+    plans += [small("shupe", index=91 + i, kind="severed", severing=how) for i, how in enumerate(("withheld", "decoy", "lagged", "confounded"))]
+    attributes, dimensions = set(), set()
+    for plan in plans:
+        log, truth = make_case(plan)
+        digest = seal(log, truth, tmp_path, name=f"{plan['index']:04d}")
+        assert open_truth(tmp_path / "truth" / f"{plan['index']:04d}.json", sha256=digest)["plan"]["names"] == plan["names"]
+        attributes.add(tuple(sorted(log.attrs)))
+        dimensions |= set(map(str, log.variables))
+    assert attributes == {("kind", "sampling_rate_hz")}
+    for path in (tmp_path / "recordings").iterdir():
+        held = path.read_bytes().lower() + path.name.encode()
+        assert [word for word in words if word.encode() in held] == [], path
+    known = {"axis", "time", "rate", "temperature", "vibration", "rotation_rate", "supply_voltage", "light_power", "ramp", "accel_x"}
+    assert {name.removeprefix("time_") for name in dimensions} - known <= {"accel_y", "accel_z"} | {n for n in dimensions if n.startswith("gap_")}
+
+
+def test_channels_of_nulls_are_those_of_effects():
+    """Every channel that an effect needs is there in nulls too, so its presence says nothing."""
+    names = [set(make_case(small(None, index=i, seconds=600))[0].data_vars) for i in range(40)]
+    for channel in ("rotation_rate", "supply_voltage", "light_power", "ramp", "accel_x"):
+        assert 0 < sum(channel in held for held in names) < 40
+
+
+def test_a_sealed_recording_is_read_as_a_log(tmp_path):
+    log, truth = make_case(small("vibration_rectification"))
+    digest = seal(log, truth, tmp_path, name="a")
+    again = open_log(tmp_path / "recordings" / "a.nc")
+    np.testing.assert_array_equal(again.rate.values, log.rate.values)
+    np.testing.assert_array_equal(again.time.values, log.time.values)
+    np.testing.assert_array_equal(again.vibration.values, log.vibration.values)
+    assert again.vibration.attrs["units"] == log.vibration.attrs["units"] == "g"
+    path = tmp_path / "truth" / "a.json"
+    path.write_text(path.read_text().replace("vibration_rectification", "shupe"))
+    with pytest.raises(FormatError, match="changed after it was sealed"):
+        open_truth(path, sha256=digest)
+
+
+@pytest.mark.parametrize("how", ["withheld", "decoy", "lagged", "confounded"])
+def test_severed_driver(how):
+    rng = np.random.default_rng(0)
+    values = np.cumsum(rng.normal(size=1000))
+    channels = sever({"temperature": (values, 1.0), "vibration": (np.ones(1000), 1.0)}, "temperature", how=how, rng=rng)
+    assert ("temperature" in channels) == (how in ("lagged", "confounded"))
+    if how == "lagged":
+        lags = [np.corrcoef(values[: 1000 - k], channels["temperature"][0][k:])[0, 1] for k in range(0, 181)]
+        assert np.argmax(lags) >= 30
+    if how == "confounded":
+        assert abs(np.corrcoef(values, channels["supply_voltage"][0])[0, 1]) > 0.8
+    if how == "decoy":
+        assert "supply_voltage" in channels
+
+
+def test_composition_of_a_benchmark():
+    plans = plan_cases(400, seed=5)
+    kinds = [plan["kind"] for plan in plans]
+    assert kinds.count("null") == 100
+    assert kinds.count("strange") == kinds.count("severed") == kinds.count("buried") == kinds.count("pair") == 40
+    single = [plan["names"][0] for plan in plans if plan["kind"] == "single"]
+    assert len(set(single)) >= 14
+    assert {plan["rate"] for plan in plans} == {10.0, 100.0, 400.0}
+    assert max(plan["seconds"] for plan in plans) == 86400
+    assert min(plan["seconds"] for plan in plans) >= 600
+    gaps = [plan["gaps"] for plan in plans]
+    assert max(gaps) > 0.35
+    assert 0.4 < np.mean(np.array(gaps) == 0) < 0.6
+    assert plan_case(17, seed=5) == plans[17]
+
+
+def test_a_third_of_the_forms_are_none_of_a_fitter():
+    world = replace(white_world(seconds=600), cuts=np.array([[200.0, 220.0]]))
+    world = replace(world, light=np.linspace(1.0, 0.9, world.temperature.size))
+    flags = [entry.make(world, stream(s, name), strength=2.0).differs for name, entry in CATALOGUE.items() for s in range(2)]
+    assert np.mean(flags) > 1 / 3
+
+
+def test_unknown_effect_and_negative_case_are_explained():
+    with pytest.raises(OptionError, match="no effect 'gremlin' can be made"):
+        make_case(small("shupe") | {"names": ["gremlin"]})
+    with pytest.raises(OptionError, match="counted from 0"):
+        plan_case(-1, seed=0)
+
+
+def test_naive_detectors_see_what_is_loud_and_little_else():
+    log, truth = make_case(small("vibration_noise", strength=120.0, seconds=1800))
+    assert allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30)
+    assert channel_detector(log)
+    seen = 0
+    for i in range(8):
+        log, truth = make_case(small(None, index=30 + i, seconds=600))
+        seen += allan_detector(log.rate.values, truth, rng=np.random.default_rng(i), nulls=30)
+    assert seen <= 2
+
+
+def test_salt_on_a_log_adds_the_effect_and_leaves_the_controls_alone():
+    log, _ = make_case(small(None))
+    copies = salt(log, "vibration_rectification", 6.0, np.random.default_rng(2))
+    record = log.rate.values
+    np.testing.assert_array_equal(copies["untouched"][0].rate.values, record)
+    np.testing.assert_array_equal(copies["flipped"][0].rate.values, -record)
+    np.testing.assert_array_equal(copies["reversed"][0].rate.values, record[:, ::-1])
+    salted, truth = copies["salted"]
+    (effect,) = truth["effects"]
+    added = salted.rate.values - record
+    assert np.nanmax(np.abs(added)) == pytest.approx(effect["parameters"]["peak"]["value"], rel=0.1)
+    for axis in AXES:
+        assert (np.nanmax(np.abs(added[AXES.index(axis)])) > 0) == (axis in effect["axes"])
+    for copy, told in copies.values():
+        check_log(copy)
+        assert set(copy.data_vars) == set(salted.data_vars)
+        assert told["plan"]["kind"] == ("salted" if told["effects"] else "control")
+    with pytest.raises(OptionError, match="follows restarts"):
+        salt(log, "warm_up", 2.0, np.random.default_rng(0))
+
+
+def test_salt_on_a_real_gyro(recordings):
+    import pandas as pd
+
+    from gyrostab.log import make_log
+
+    table = pd.read_csv(recordings("rlg-static-30min/lasergyro.csv.gz"), nrows=60_000)
+    gyros = [column for column in table.columns if column.lower().startswith(("gyro", "w", "g"))][:3]
+    log = make_log(table[gyros].to_numpy().T, rate=100.0, unit="deg/h")
+    copies = salt(log, "spectral_line", 5.0, np.random.default_rng(4))
+    added = copies["salted"][0].rate.values - log.rate.values
+    assert np.abs(added).max() > 0
+    assert copies["salted"][1]["effects"][0]["name"] == "spectral_line"

@@ -1,0 +1,207 @@
+"""The physics of the concealed effects against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import allantools
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import signal
+
+from gyrostab.concealed import coil, floor, light, loop, telemetry, tool, vibration
+from gyrostab.concealed.naive import allan_band, allan_variance, octaves
+
+
+@pytest.mark.parametrize(("thickness", "diffusivity"), [(0.012, 2.2e-7), (0.007, 3e-7)])
+def test_coil_forgets_a_step_with_the_slowest_mode(thickness, diffusivity):
+    tau = coil.diffusion_time(thickness, diffusivity)
+    face = np.r_[20.0, np.full(round(8 * tau), 30.0)]
+    inner = coil.layer_temperatures(face, dt=1.0, layers=48, thickness=thickness, diffusivity=diffusivity)[-1]
+    late = slice(round(3 * tau), round(6 * tau))
+    slope = np.polyfit(np.arange(face.size)[late], np.log(30.0 - inner[late]), 1)[0]
+    assert -1 / slope == pytest.approx(tau, rel=5e-3)
+
+
+def test_coil_lags_behind_a_steady_ramp_by_a_parabola():
+    d, kappa, speed, layers = 0.012, 2.2e-7, 1 / 60, 48
+    layer = coil.layer_temperatures(speed * np.arange(4000.0), dt=1.0, layers=layers, thickness=d, diffusivity=kappa)[:, -1]
+    x = (np.arange(layers) + 0.5) * d / layers
+    behind = speed * (d * x - x**2 / 2) / kappa
+    np.testing.assert_allclose(speed * 3999 - layer, behind, rtol=0.01, atol=2e-3)
+
+
+def test_heat_that_enters_a_coil_is_the_heat_that_it_holds():
+    d, kappa, layers = 0.012, 2.2e-7, 24
+    face = 20 + 5 * np.sin(np.arange(2000) / 150.0)
+    layer = coil.layer_temperatures(face, dt=1.0, layers=layers, thickness=d, diffusivity=kappa)
+    into = kappa * (face - layer[0]) / (d / layers / 2)  # through half a cell, per unit of area and heat capacity
+    entered = np.sum(0.5 * (into[1:] + into[:-1]))
+    assert entered == pytest.approx((layer[:, -1] - layer[:, 0]).sum() * d / layers, rel=1e-9)
+
+
+def test_quadrupole_cancels_what_a_trim_error_lets_in():
+    ramp = 20 + np.arange(3000) / 60.0
+    even = coil.coil_rate(ramp, dt=1.0, weights=coil.layer_weights(24))[-1]
+    trimmed = coil.coil_rate(ramp, dt=1.0, weights=coil.layer_weights(24, trim=1e-3))[-1]
+    # half to half asymmetry of 2 trim: n / (D L) (dn/dT + n alpha) 2 trim L^2 dT/dt
+    expected = 1.45 / (0.04 * 500) * (8.6e-6 + 1.45 * 0.55e-6) * 2e-3 * 500**2 / 60 * coil.DEG_PER_HOUR
+    assert abs(even) < 1e-3 * expected
+    assert trimmed == pytest.approx(expected, rel=1e-3)
+
+
+def test_each_part_of_the_detector_noise_has_its_own_power_law():
+    power = np.array([1e-6, 4e-6])
+    shot = light.relative_psd(power, rin=0.0, load=1e12)
+    thermal = light.relative_psd(power, rin=0.0, load=1.0)
+    excess = light.relative_psd(power, rin=1e-7)
+    assert shot[0] / shot[1] == pytest.approx(4.0, rel=1e-3)
+    assert thermal[0] / thermal[1] == pytest.approx(16.0, rel=1e-3)
+    assert excess[0] / excess[1] == pytest.approx(1.0, rel=1e-3)
+    assert light.detector_psd(np.array([1e-5]))["shot"][0] == pytest.approx(2 * 1.602176634e-19 * 0.9e-5)
+
+
+def test_shot_limited_level_is_the_textbook_one():
+    power, depth = 20e-6, math.pi / 2
+    seen = power * (1 + math.cos(depth))
+    phase = math.sqrt(2 * light.CHARGE / (0.9 * seen)) * (1 + math.cos(depth)) / math.sin(depth) / math.sqrt(2)
+    rate = phase * 1.55e-6 * light.LIGHT_SPEED / (2 * math.pi * 500 * 0.04)
+    level = light.rate_noise(np.array([power]), rin=0.0, load=1e12, depth=depth)[0]
+    assert level == pytest.approx(math.degrees(rate) * 3600, rel=1e-3)
+
+
+@given(st.lists(st.floats(-0.9, 0.9), min_size=2, max_size=3))
+@settings(max_examples=20, deadline=None)
+def test_shared_source_changes_no_axis_by_itself(shares):
+    rng = np.random.default_rng(1)
+    own, common = rng.normal(size=(len(shares), 20_000)) * 3.0, rng.normal(size=20_000)
+    both = light.share_source(own, common, shares=np.array(shares))
+    np.testing.assert_allclose(both.std(axis=1), 3.0, rtol=0.04)
+    assert np.corrcoef(both)[0, 1] == pytest.approx(shares[0] * shares[1], abs=0.04)
+
+
+def test_resets_come_as_often_as_the_rate_says():
+    rate, seconds, dt = 22.0, 500.0, 0.01
+    phase = loop.ramp_phase(np.full(round(seconds / dt), rate), dt=dt)
+    expected = 0.04 * math.radians(rate / 3600) / (1.45 * 1.55e-6) * seconds
+    assert (np.diff(phase) < 0).sum() == math.floor(expected)
+
+
+def test_dead_zone_holds_at_zero_and_is_odd():
+    w = np.linspace(-1, 1, 201)
+    out = loop.dead_zone(w, width=0.3)
+    assert (out[np.abs(w) <= 0.3] == 0).all()
+    np.testing.assert_allclose(out, -out[::-1], atol=1e-7)
+
+
+def test_mount_is_a_damped_spring():
+    f = np.array([10.0, 60.0, 120.0, 400.0])
+    _, got = signal.freqz(*vibration.mount_filter(120.0, quality=8.0), worN=f, fs=vibration.FAST)
+    x = f / 120.0
+    expected = np.sqrt((1 + (x / 8) ** 2) / ((1 - x**2) ** 2 + (x / 8) ** 2))
+    np.testing.assert_allclose(np.abs(got), expected, rtol=0.12)  # the bilinear rule bends the upper end
+
+
+@pytest.mark.parametrize(("kind", "power"), [("point", 0), ("dump", 1), ("cic2", 2), ("cic3", 3)])
+def test_a_line_above_nyquist_folds_down_with_the_factor_of_its_filter(kind, power):
+    f, rate = 730.0, 400.0
+    x = np.sqrt(2) * np.sin(2 * np.pi * f * np.arange(200_000) / vibration.FAST)
+    logged = vibration.decimate(x, rate=rate, kind=kind)[50:]
+    m = vibration.FAST / rate
+    factor = abs(math.sin(math.pi * f / rate) / (m * math.sin(math.pi * f / vibration.FAST))) ** power
+    assert logged.std() == pytest.approx(factor, rel=2e-3)
+    freq, density = signal.periodogram(logged, fs=rate)
+    assert freq[np.argmax(density)] == pytest.approx(800.0 - f, abs=0.1)
+
+
+def test_folded_density_is_what_the_decimator_gives():
+    rng = np.random.default_rng(2)
+    mount = vibration.mount_filter(650.0, quality=6.0)
+    x = signal.lfilter(*mount, vibration.band_noise(rng, 800_000, low=600, high=800))
+    logged = vibration.decimate(x, rate=400.0, kind="dump")
+    freq, measured = signal.welch(logged, fs=400.0, nperseg=256)
+    expected = 2 * vibration.folded_psd(freq[2:-2], rate=400.0, kind="dump", low=600, high=800, mount=mount)
+    assert np.median(measured[2:-2] / expected) == pytest.approx(1.0, abs=0.03)
+    assert logged.var() == pytest.approx(np.trapezoid(expected, freq[2:-2]), rel=0.05)
+
+
+def test_rectification_saturates():
+    levels = np.array([0.1, 100.0])
+    low, high = vibration.rectify(levels, exponent=1.9, saturation=8.0)
+    assert low == pytest.approx(0.1**1.9, rel=1e-3)
+    assert high == pytest.approx(8.0**1.9, rel=0.02)
+
+
+@pytest.mark.parametrize("method", ["spectrum", "relaxations"])
+def test_noise_floor_has_the_allan_deviation_of_its_coefficients(method):
+    rate, size = 10.0, 2**16
+    rng = np.random.default_rng(3)
+    tau = np.array([1.0, 8.0, 64.0, 512.0])
+    terms = {
+        "N": (lambda: floor.white_level(0.01) * math.sqrt(rate) * rng.standard_normal(size), 0.01**2 * 3600 / tau),
+        "B": (lambda: floor.flicker(rng, size, b=0.3, rate=rate, method=method), np.full(4, 2 * math.log(2) / math.pi * 0.3**2)),
+        "K": (lambda: floor.random_walk(rng, size, k=0.5, rate=rate), 0.5**2 * tau / 3600 / 3),
+    }
+    for name, (draw, expected) in terms.items():
+        records = 8
+        got = np.mean([allantools.oadev(draw(), rate=rate, data_type="freq", taus=tau)[1] ** 2 for _ in range(records)], axis=0)
+        freedom = records * size / rate / tau
+        np.testing.assert_array_less(np.abs(got / expected - 1), 0.04 + 5 / np.sqrt(freedom), err_msg=name)
+
+
+def test_steps_of_the_angle_have_the_quantization_law():
+    rate, q = 10.0, 2.0
+    rng = np.random.default_rng(4)
+    out = floor.quantize_angle(rng.normal(20.0, 8.0, 100_000), q=q, rate=rate)
+    plain = floor.quantize_angle(rng.normal(20.0, 8.0, 100_000), q=0.0, rate=rate)
+    urad = math.degrees(1e-6) * 3600
+    tau, dev, _, _ = allantools.oadev(out, rate=rate, data_type="freq", taus=[0.1, 0.2])
+    base = allantools.oadev(plain, rate=rate, data_type="freq", taus=[0.1, 0.2])[1]
+    np.testing.assert_allclose(dev**2 - base**2, 3 * (q * urad) ** 2 / tau**2, rtol=0.15)
+
+
+def test_floor_density_adds_up_to_the_variance_of_its_steps():
+    f = (np.arange(20_000) + 0.5) / 20_000 * 5.0
+    q = 1.5 * math.degrees(1e-6) * 3600
+    density = floor.floor_psd(f, noise={"Q": 1.5}, rate=10.0)
+    assert 2 * density.mean() * 5.0 == pytest.approx(2 * q**2 * 100.0, rel=1e-6)
+
+
+def test_own_allan_variance_is_that_of_allantools():
+    x = np.cumsum(np.random.default_rng(5).normal(size=5000))
+    factors = octaves(x.size)
+    expected = allantools.oadev(x, rate=1.0, data_type="freq", taus=factors)[1] ** 2
+    np.testing.assert_allclose(allan_variance(x, factors), expected, rtol=1e-9)
+
+
+def test_noise_leaves_its_own_allan_band_in_one_of_a_hundred():
+    size, rate, noise = 2000, 10.0, {"N": 0.003, "B": 0.004, "K": 0.05, "Q": 0.0}
+    rng = np.random.default_rng(6)
+    missing = telemetry.lose(rng, size, share=0.2, frame=10, burst=4)
+    out = 0
+    for _ in range(12):
+        band = allan_band(noise=noise, rate=rate, missing=missing, rng=rng)
+        for _ in range(100):
+            x = floor.white_level(0.003) * math.sqrt(rate) * rng.standard_normal(size) + floor.flicker(rng, size, b=0.004, rate=rate)
+            x += floor.random_walk(rng, size, k=0.05, rate=rate)
+            x[missing] = np.nan
+            z = (np.log(allan_variance(x, band["factors"])) - band["mean"]) / band["sd"]
+            out += np.abs(z).max() > band["limit"]
+    assert 2 <= out <= 36  # 12 expected; the tail of a chi-square is longer than normal
+
+
+@given(st.floats(0.02, 0.6), st.floats(1.0, 8.0))
+@settings(max_examples=15, deadline=None)
+def test_telemetry_loses_the_share_that_was_asked_for(share, burst):
+    lost = telemetry.lose(np.random.default_rng(7), 200_000, share=share, frame=5, burst=burst)
+    assert lost.mean() == pytest.approx(share, abs=0.06)
+
+
+def test_toolface_turns_earth_and_gravity_together():
+    angle = tool.toolface(tool.rotation(np.random.default_rng(8), 600.0, dt=0.1), dt=0.1)
+    x, y = tool.cross_axis(angle, across=9.0)
+    np.testing.assert_allclose(np.hypot(x, y), 9.0)
+    gx, gy, _ = tool.gravity(angle, inclination=40.0)
+    np.testing.assert_allclose(gx * y, gy * x, atol=1e-9)
