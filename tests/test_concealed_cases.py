@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import gyrostab
 from gyrostab.concealed import channel_detector, make_case, open_truth, plan_case, plan_cases, salt, seal
 from gyrostab.concealed.catalogue import CATALOGUE, STRANGE
 from gyrostab.concealed.limits import NATS, amplitude_for, mean_size, shared_size, variance_gain, variance_size
@@ -20,7 +21,6 @@ from gyrostab.concealed.sever import sever
 from gyrostab.concealed.visible import FAINT
 from gyrostab.concealed.world import AXES, draw_world, stream
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.export import open_log
 from gyrostab.regularise import gap_table
 from gyrostab.schema import check_log
 
@@ -157,7 +157,9 @@ def test_a_loud_effect_is_never_called_buried():
 def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
     words = [*EVERY, "strength", "concealed", "buried", "severed", "withheld", "decoy", "truth", "effect", "seed", "sealed"]
     plans = [small(name, index=i) for i, name in enumerate(EVERY)] + [small(None, index=90)]
-    plans += [small("shupe", index=91 + i, kind="severed", severing=how) for i, how in enumerate(("withheld", "decoy", "lagged", "confounded"))]
+    plans += [
+        small("shupe", index=91 + i, kind="severed", severing=how) for i, how in enumerate(("withheld", "decoy", "lagged", "confounded"))
+    ]
     attributes, dimensions = set(), set()
     for plan in plans:
         log, truth = make_case(plan)
@@ -170,7 +172,9 @@ def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
         held = path.read_bytes().lower() + path.name.encode()
         assert [word for word in words if word.encode() in held] == [], path
     known = {"axis", "time", "rate", "temperature", "vibration", "rotation_rate", "supply_voltage", "light_power", "ramp", "accel_x"}
-    assert {name.removeprefix("time_") for name in dimensions} - known <= {"accel_y", "accel_z"} | {n for n in dimensions if n.startswith("gap_")}
+    assert {name.removeprefix("time_") for name in dimensions} - known <= {"accel_y", "accel_z"} | {
+        n for n in dimensions if n.startswith("gap_")
+    }
 
 
 def test_channels_of_nulls_are_those_of_effects():
@@ -183,7 +187,7 @@ def test_channels_of_nulls_are_those_of_effects():
 def test_a_sealed_recording_is_read_as_a_log(tmp_path):
     log, truth = make_case(small("vibration_rectification"))
     digest = seal(log, truth, tmp_path, name="a")
-    again = open_log(tmp_path / "recordings" / "a.nc")
+    again = gyrostab.regularise(gyrostab.read_log(tmp_path / "recordings" / "a.nc"))
     np.testing.assert_array_equal(again.rate.values, log.rate.values)
     np.testing.assert_array_equal(again.time.values, log.time.values)
     np.testing.assert_array_equal(again.vibration.values, log.vibration.values)

@@ -52,6 +52,8 @@ def fingerprint(text: str) -> str:
 def seal(log: xr.Dataset, truth: dict[str, Any], directory: str | Path, *, name: str) -> str:
     """Write ``recordings/NAME.nc`` and ``truth/NAME.json``; return the SHA-256 of the latter.
 
+    The recording is read as any foreign NetCDF file is, with `gyrostab.read_log`.
+
     Parameters
     ----------
     log : xarray.Dataset

@@ -204,7 +204,7 @@ def missed(table: pd.DataFrame) -> list[str]:
     """
     lost = table[[met is False and bool(target) for met, target in zip(table["met"], table["target"], strict=True)]]
     return [
-        "{quantity}: {value:.3g} ({low:.3g} to {high:.3g}, n = {n}), target {target}: missed".format(**line)
+        "{quantity}: {value:.3g} ({low:.3g} to {high:.3g}, n = {n}), target {target}: missed".format_map(line)
         for line in lost.to_dict("records")
     ]
 
