@@ -101,9 +101,27 @@ def diagnose(
     >>> found.verdict, [effect["name"] for effect in found.effects]                                      # doctest: +SKIP
     ('explained', ['vibration_noise'])
     """
-    begun = time.perf_counter()
-    check_log(log)
+    from threadpoolctl import threadpool_limits
+
     _check_options(nulls, false_alarm_level, seed)
+    check_log(log)
+    with threadpool_limits(1, user_api="blas"):  # the matrices are many and small: threads would only wait for each other
+        return _diagnose(log, simulation, quiet, seed, nulls, false_alarm_level, block, restart_gap, progress)
+
+
+def _diagnose(
+    log: xr.Dataset,
+    simulation: Any,
+    quiet: Any,
+    seed: int,
+    nulls: int,
+    level: float,
+    block: Any,
+    restart_gap: Any,
+    progress: Stage,
+) -> Diagnosis:
+    """One step after the other."""
+    begun = time.perf_counter()
     given = simulation if simulation is None or isinstance(simulation, xr.Dataset | Model) else read_model(simulation)
     if isinstance(given, xr.Dataset):
         _check_alike(log, given)
@@ -113,12 +131,12 @@ def diagnose(
     records = _records(reduced, baseline, nulls, seed)
     progress("comparing", 0)
     null = null_scores(baseline, records())
-    found = locate(reduced, baseline, null, level=false_alarm_level)
+    found = locate(reduced, baseline, null, level=level)
     progress("naming", 0)
-    naming = name_effects(reduced, baseline, records(), level=false_alarm_level / 2.0, seed=seed, progress=progress)
+    naming = name_effects(reduced, baseline, records(), level=level / 2.0, seed=seed, progress=progress)
     progress("fitting", 0)
     own = given if isinstance(given, Model) else None
-    return _concluded(reduced, baseline, found, naming, null, level=false_alarm_level, own=own, begun=begun)
+    return _concluded(reduced, baseline, found, naming, null, level=level, own=own, begun=begun)
 
 
 def _check_options(nulls: int, level: float, seed: int) -> None:
@@ -159,7 +177,6 @@ def _baseline(reduced: xr.Dataset, given: xr.Dataset | Model | None, quiet: Any,
 
 def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -> Callable[[], Iterable[xr.Dataset]]:
     """The same null records as often as they are asked for: kept where they are small, drawn again where not."""
-
     together = int(np.clip(_AT_ONCE / (reduced["power"].size * 8), 25, count))
 
     def draw() -> Iterable[xr.Dataset]:
