@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import os
 from datetime import UTC, datetime
 from importlib import metadata, resources
@@ -15,11 +13,11 @@ import xarray as xr
 
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
-from gyrostab.plot.style import duration, save_png
+from gyrostab.plot.style import duration, embedded
 from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_log, check_product
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 __all__ = ["write_report"]
 
@@ -253,23 +251,17 @@ def _figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]
 
     figures = []
     if log is not None:
-        figures.append(_embed(plot_signal(log), "Signal as recorded", _READ["signal"]))
-    figures.append(_embed(plot_coefficients(product), "Noise coefficients over time", _READ["coefficients"]))
-    figures.append(_embed(plot_davar(product), "Dynamic Allan deviation", _READ["davar"]))
-    figures.append(_embed(plot_davar(product, relative=True), "Change of the dynamic Allan deviation", _READ["change"]))
+        figures.append(embedded(plot_signal(log), "Signal as recorded", _READ["signal"]))
+    figures.append(embedded(plot_coefficients(product), "Noise coefficients over time", _READ["coefficients"]))
+    figures.append(embedded(plot_davar(product), "Dynamic Allan deviation", _READ["davar"]))
+    figures.append(embedded(plot_davar(product, relative=True), "Change of the dynamic Allan deviation", _READ["change"]))
     for name in product["axis"].values:
-        figures.append(_embed(plot_adev(product, str(name)), f"Allan deviation of one window, axis {name}", _READ["adev"]))
+        figures.append(embedded(plot_adev(product, str(name)), f"Allan deviation of one window, axis {name}", _READ["adev"]))
     if min(product.sizes["time"], product.sizes["tau"]) < 2:
         return figures
     first = str(product["axis"].values[0])
-    figures.append(_embed(plot_davar_3d(product, axis=first), f"Dynamic Allan deviation as a surface, axis {first}", _READ["davar_3d"]))
+    figures.append(embedded(plot_davar_3d(product, axis=first), f"Dynamic Allan deviation as a surface, axis {first}", _READ["davar_3d"]))
     return figures
-
-
-def _embed(figure: Figure, alt: str, caption: str) -> dict[str, str]:
-    buffer = io.BytesIO()
-    save_png(figure, buffer)
-    return {"png": base64.b64encode(buffer.getvalue()).decode("ascii"), "alt": alt, "caption": caption}
 
 
 #: How to read each figure.

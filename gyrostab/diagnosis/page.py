@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -17,10 +15,10 @@ from gyrostab.diagnose.result import Diagnosis, check_diagnosis
 from gyrostab.diagnose.sentences import axes_text, chance, length_text, next_measurement, plain_name, summary
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
-from gyrostab.plot.style import save_png
+from gyrostab.plot.style import embedded
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 __all__ = ["write_diagnosis_report"]
 
@@ -203,18 +201,12 @@ def _figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
 
     surfaces, content = diagnosis.surfaces, diagnosis.content
     return [
-        _embed(plot_surfaces(surfaces, content), "Recording, simulation before and after", _READ["surfaces"]),
-        _embed(plot_change(surfaces, content), "Where they differ", _READ["change"]),
-        _embed(plot_means(surfaces, content), "Mean rate over time, and what drives it", _READ["means"]),
-        _embed(plot_deviations(surfaces), "Allan deviation of the whole record", _READ["deviations"]),
-        _embed(plot_spectra(surfaces), "Power spectrum of the whole record", _READ["spectra"]),
+        embedded(plot_surfaces(surfaces, content), "Recording, simulation before and after", _READ["surfaces"]),
+        embedded(plot_change(surfaces, content), "Where they differ", _READ["change"]),
+        embedded(plot_means(surfaces, content), "Mean rate over time, and what drives it", _READ["means"]),
+        embedded(plot_deviations(surfaces), "Allan deviation of the whole record", _READ["deviations"]),
+        embedded(plot_spectra(surfaces), "Power spectrum of the whole record", _READ["spectra"]),
     ]
-
-
-def _embed(figure: Figure, alt: str, caption: str) -> dict[str, str]:
-    buffer = io.BytesIO()
-    save_png(figure, buffer)
-    return {"png": base64.b64encode(buffer.getvalue()).decode("ascii"), "alt": alt, "caption": caption}
 
 
 #: How to read each figure.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import os
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ __all__ = [
     "axis_names",
     "axis_style",
     "duration",
+    "embedded",
     "label_log_axis",
     "new_figure",
     "save_png",
@@ -181,6 +183,13 @@ def save_png(figure: Figure, target: str | os.PathLike[str] | IO[bytes], *, dpi:
         from PIL import Image
 
         Image.open(drawn).convert("RGB").quantize(colours).save(target, format="PNG", optimize=True)
+
+
+def embedded(figure: Figure, alt: str, caption: str) -> dict[str, str]:
+    """A figure for a page that is one file: its PNG in base 64, what it shows in a few words, and how to read it."""
+    buffer = io.BytesIO()
+    save_png(figure, buffer)
+    return {"png": base64.b64encode(buffer.getvalue()).decode("ascii"), "alt": alt, "caption": caption}
 
 
 def time_axis(ax: Axes, times: NDArray[Any]) -> None:
