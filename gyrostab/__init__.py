@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from gyrostab.plot import plot_davar_3d as plot_davar_3d
     from gyrostab.plot import plot_signal as plot_signal
     from gyrostab.plot import save_figures as save_figures
+    from gyrostab.prove import prove as prove
     from gyrostab.read import read_channel as read_channel
     from gyrostab.read import read_log as read_log
     from gyrostab.regularise import gap_table as gap_table
@@ -71,6 +72,7 @@ _HOME = {
     "plot_davar": "plot",
     "plot_davar_3d": "plot",
     "plot_signal": "plot",
+    "prove": "prove",
     "read_channel": "read",
     "read_log": "read",
     "read_model": "simulate",
@@ -106,6 +108,7 @@ __all__ = [
     "plot_davar",
     "plot_davar_3d",
     "plot_signal",
+    "prove",
     "read_channel",
     "read_log",
     "read_model",

@@ -1,0 +1,77 @@
+"""The curves of a benchmark: what is found and named against strength, and how often a name that is given is right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+__all__ = ["draw_completeness", "draw_reliability"]
+
+_ACROSS = 5
+
+
+def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
+    """Prepare a panel for each effect: shares detected and named against strength, with Wilson's intervals."""
+    from gyrostab.plot.style import new_figure, save_png
+
+    names = list(dict.fromkeys(curves["effect"])) if len(curves) else []
+    down = max(1, math.ceil(len(names) / _ACROSS))
+    figure = new_figure(2.4 * _ACROSS, 1.8 * down + 0.6)
+    panels: Any = figure.subplots(down, _ACROSS, sharex=True, sharey=True, squeeze=False)
+    for place, panel in enumerate(panels.flat):
+        if place < len(names):
+            _panel(panel, curves[curves["effect"] == names[place]], names[place].replace("_", " "))
+        else:
+            panel.set_axis_off()
+    figure.supxlabel("strength, in units of the closed-form limit")
+    figure.supylabel("share of the cases, with 95 % interval")
+    if names:
+        figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
+    return lambda target: save_png(figure, target, colours=64)
+
+
+def _panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
+    from gyrostab.plot.style import COLOURS, MARKERS
+
+    for number, key in enumerate(("detected", "named")):
+        share = part[key].to_numpy()
+        reach = [share - part[f"{key}_low"].to_numpy(), part[f"{key}_high"].to_numpy() - share]
+        panel.errorbar(
+            part["strength"].to_numpy() * (0.97, 1.03)[number],
+            share,
+            yerr=[limit.clip(min=0.0) for limit in reach],
+            color=COLOURS[number],
+            marker=MARKERS[number],
+            markersize=4,
+            linewidth=1.2,
+            elinewidth=0.7,
+            label=key,
+        )
+    panel.set_title(f"{title} ({int(part['n'].sum())})", fontsize="small")
+    panel.set_xscale("log", base=2)
+    panel.set_xticks([0.5, 1, 2, 4, 8], ["0.5", "1", "2", "4", "8"])
+    panel.set_ylim(-0.05, 1.05)
+    panel.axvline(1.5, color="#8c8c8c", linewidth=0.7, linestyle=":")
+
+
+def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
+    """Prepare a bar for each name: the share of its claims that stand for something true, with Wilson's interval."""
+    from gyrostab.plot.style import COLOURS, new_figure, save_png
+
+    figure = new_figure(6.5, 1.2 + 0.26 * max(3, len(reliability)))
+    panel: Any = figure.subplots()
+    for place, line in enumerate(reliability.itertuples(index=False)):
+        claim: Any = line
+        panel.barh(place, claim.right, color=COLOURS[2], height=0.6)
+        panel.plot([claim.low, claim.high], [place, place], color="black", linewidth=1.0)
+    panel.set_yticks(range(len(reliability)), [f"{line.name.replace('_', ' ')} ({line.n})" for line in reliability.itertuples(index=False)])
+    panel.invert_yaxis()
+    panel.set_xlim(0, 1)
+    panel.set_xlabel("share of the claims that are right, with 95 % interval")
+    return lambda target: save_png(figure, target, colours=64)

@@ -1,0 +1,198 @@
+"""The folder of a benchmark: what it was asked for, which code has worked on it, and what is finished.
+
+``benchmark.json`` comes first; then ``recordings/`` and ``truth/`` grow together, ``SHA256SUMS`` seals the truths before the first file of
+``diagnoses/``, and ``comparisons/`` follow once the seal is open.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import shutil
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
+from gyrostab.output import new_output
+
+__all__ = ["TUNING", "asked", "begin", "case_name", "code_state", "look", "read_sums", "write_json", "write_sums", "write_text"]
+
+#: Seeds below this one are for tuning; what is published uses others.
+TUNING = 1_000_000
+
+_SCHEMA = "gyrostab.prove/1"
+_SUMS = "SHA256SUMS"
+_FOLDERS = ("recordings", "truth", "diagnoses", "comparisons", "failed")
+_FILES = ("benchmark.json", _SUMS, "scores.csv", "table.md", "completeness.png", "reliability.png", "lock")
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a file that has its name only once it is complete."""
+    with new_output(path, overwrite=True) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
+
+def write_json(path: Path, content: Any) -> Path:
+    """As `write_text`, of JSON."""
+    return write_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def case_name(seed: int, index: int) -> str:
+    """Name of the files of a case; who does not know the seed learns nothing from it, not even the order.
+
+    Examples
+    --------
+    >>> case_name(1, 0) == case_name(1, 0), case_name(1, 0) == case_name(1, 1), len(case_name(1, 0))
+    (True, False, 12)
+    """
+    return hashlib.sha256(f"name of case {index} of seed {seed}".encode()).hexdigest()[:12]
+
+
+def code_state() -> str:
+    """Short fingerprint of the source of the package."""
+    import gyrostab
+
+    root = Path(gyrostab.__file__).parent
+    listing = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        listing.update(f"{path.relative_to(root).as_posix()}\n".encode() + path.read_bytes())
+    return listing.hexdigest()[:12]
+
+
+def asked(directory: Path) -> dict[str, Any] | None:
+    """What a benchmark that was begun in this folder was asked for; None when none was."""
+    try:
+        content = json.loads((directory / "benchmark.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{directory / 'benchmark.json'}: cannot be read ({error}); begin again with --overwrite") from error
+    if not isinstance(content, dict) or content.get("schema") != _SCHEMA:
+        raise FormatError(f"{directory / 'benchmark.json'}: is no benchmark of this version; begin again in another folder with -o")
+    return content
+
+
+def look(
+    directory: Path, wanted: Mapping[str, int | None], usual: Mapping[str, int], *, resume: bool, overwrite: bool
+) -> tuple[dict[str, Any] | None, dict[str, int]]:
+    """What was begun in a folder and is to go on, or None, and what is to be done; see `begin`. Changes nothing."""
+    _check_place(directory)
+    before = asked(directory) if directory.is_dir() and (resume or not overwrite) else None
+    if before is None:
+        chosen = {name: usual[name] if value is None else value for name, value in wanted.items()}
+        _check_wishes(chosen)
+        _check_content(directory, overwrite=overwrite)
+        return None, chosen
+    if not resume:
+        raise OutputError(f"{directory} holds a benchmark already: --resume goes on with it, --overwrite replaces it; or give another -o")
+    other = [f"{name} {before[name]}, not {value}" for name, value in wanted.items() if value is not None and value != before[name]]
+    if other:
+        raise ResumeError(f"{directory}: was begun with {', '.join(other)}; leave that out, or begin again with --overwrite")
+    return before, {name: before[name] for name in wanted}
+
+
+def begin(directory: Path, wanted: Mapping[str, int | None], usual: Mapping[str, int], *, resume: bool, overwrite: bool) -> dict[str, Any]:
+    """Make the folder, or take up what was begun in it.
+
+    Parameters
+    ----------
+    directory : pathlib.Path
+        The folder; its parent must exist.
+    wanted : mapping
+        ``cases``, ``seed`` and ``nulls``, None where it was not said.
+    usual : mapping
+        What stands where nothing was said.
+    resume, overwrite : bool
+        Go on where a run stopped; forget one.
+
+    Returns
+    -------
+    dict
+        Content of ``benchmark.json``.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be made, or holds something.
+    OptionError
+        When a number makes no sense.
+    ResumeError
+        When what was begun was asked for something else.
+    """
+    before, chosen = look(directory, wanted, usual, resume=resume, overwrite=overwrite)
+    state = code_state()
+    if before is not None:
+        for left in (*directory.glob(".*.part"), *directory.glob("*/.*.part")):  # of a run that was killed
+            _remove(left)
+        if state != before["code"][-1]:
+            before["code"].append(state)
+            write_json(directory / "benchmark.json", before)
+        return before
+    directory.mkdir(exist_ok=True)
+    for item in directory.iterdir():
+        if item.name != "lock":
+            _remove(item)
+    for name in _FOLDERS:
+        (directory / name).mkdir()
+    content = {
+        "schema": _SCHEMA,
+        **chosen,
+        "code": [state],
+        "begun": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+    }
+    write_json(directory / "benchmark.json", content)
+    return content
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+
+
+def _check_wishes(chosen: Mapping[str, int]) -> None:
+    if chosen["cases"] < 1:
+        raise OptionError(f"cases={chosen['cases']}: give at least one case; 20 hold every kind, 400 give the published figures")
+    if chosen["seed"] < 0:
+        raise OptionError(f"seed={chosen['seed']}: give a whole number from 0 up")
+    if chosen["nulls"] < 100:
+        raise OptionError(f"nulls={chosen['nulls']}: a diagnosis needs 100 null records at least; give 400, or 200 for a quick look")
+
+
+def _check_place(directory: Path) -> None:
+    if not directory.parent.is_dir():
+        raise OutputError(f"output {str(directory)!r}: there is no directory {str(directory.parent)!r}; make it first or choose another")
+    if directory.exists() and not directory.is_dir():
+        raise OutputError(f"output {str(directory)!r} is a file; give the name of a folder with -o")
+
+
+def _check_content(directory: Path, *, overwrite: bool) -> None:
+    found = sorted(item.name for item in directory.iterdir() if item.name != "lock") if directory.is_dir() else []
+    others = [name for name in found if name not in (*_FILES, *_FOLDERS) and not name.endswith(".part")]
+    if others:
+        raise OutputError(f"output {str(directory)!r} holds {others[0]!r}; give the name of a folder of its own with -o")
+    if found and not overwrite:
+        raise OutputError(f"output {str(directory)!r} is not empty; give --overwrite to replace what is in it, or another name with -o")
+
+
+def write_sums(directory: Path, sums: Mapping[str, str]) -> str:
+    """Seal all truths: write ``SHA256SUMS`` as ``sha256sum -c`` reads it; its own SHA-256."""
+    text = "".join(f"{value}  truth/{name}.json\n" for name, value in sorted(sums.items()))
+    write_text(directory / _SUMS, text)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read_sums(directory: Path) -> tuple[dict[str, str], str] | None:
+    """Name of each case to the SHA-256 of its truth, and the SHA-256 of the list; None where nothing was sealed yet."""
+    try:
+        text = (directory / _SUMS).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    lines = [line.split("  truth/") for line in text.splitlines()]
+    return {name.removesuffix(".json"): value for value, name in lines}, hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,118 @@
+"""What came out, as files that people and programs read: every score, the table, what was missed and what failed."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from gyrostab.concealed import curves, markdown, missed, reliability, score_case
+from gyrostab.output import new_output
+from gyrostab.prove.figures import draw_completeness, draw_reliability
+from gyrostab.prove.folder import TUNING, write_text
+
+__all__ = ["page_text", "score_rows", "write_outcome"]
+
+Rows = list[dict[str, Any]]
+
+#: Stands for the diagnosis of a case that has none: nothing was found in it.
+_NOTHING = {"verdict": "no mismatch", "mismatches": [], "effects": [], "unexplained": [], "held_out": {}, "seconds": math.nan}
+
+_SHOWN = 40  # cases that a list holds
+
+
+def score_rows(found: Mapping[str, dict[str, Any]], truths: Mapping[str, dict[str, Any]], naive: Mapping[str, Mapping[str, bool]]) -> Rows:
+    """All rows of `gyrostab.concealed.score_case`, with the name of the case; a case without a diagnosis counts as nothing found."""
+    return [
+        {"name": name, "failed": name not in found, **row}
+        for name, truth in truths.items()
+        for row in score_case(found.get(name, _NOTHING), truth, naive=naive[name])
+    ]
+
+
+def write_outcome(
+    folder: Path, rows: Rows, table: pd.DataFrame, *, job: Mapping[str, Any], sealed: str, failed: Mapping[str, str]
+) -> list[Path]:
+    """Write ``scores.csv``, ``table.md``, ``completeness.png`` and ``reliability.png``."""
+    plain = [{key: json.dumps(value) if isinstance(value, list | dict | tuple) else value for key, value in row.items()} for row in rows]
+    targets = [folder / name for name in ("scores.csv", "table.md", "completeness.png", "reliability.png")]
+    write_text(targets[0], pd.DataFrame(plain).to_csv(index=False))
+    write_text(targets[1], page_text(rows, table, job=job, sealed=sealed, failed=failed))
+    for target, draw in zip(targets[2:], (draw_completeness(curves(rows)), draw_reliability(reliability(rows))), strict=True):
+        with new_output(target, overwrite=True) as temporary:
+            draw(temporary)
+    return targets
+
+
+def page_text(
+    rows: Sequence[Mapping[str, Any]], table: pd.DataFrame, *, job: Mapping[str, Any], sealed: str, failed: Mapping[str, str]
+) -> str:
+    """The outcome in Markdown: how it was made, the table, the targets missed, the curves, and the cases that went wrong."""
+    shown = curves(rows)
+    every = shown[shown["effect"] == "all"] if len(shown) else shown
+    each = reliability(rows)
+    parts = [
+        _made(rows, job, sealed),
+        "### Figures with 95 % intervals and targets",
+        markdown(table),
+        "### Targets that were missed",
+        _listed(missed(table), "none"),
+        "### Completeness against strength, in units of the closed-form limit",
+        markdown(every.drop(columns="effect")) if len(every) else "no effects among these cases",
+        "### Claims by name",
+        markdown(each) if len(each) else "nothing was named",
+        "### Wrong names",
+        _listed([_wrong(row) for row in _cases(rows) if row["wrong"]], "none"),
+        "### Clear effects that were missed",
+        _listed([_silent(row) for row in rows if row["effect"] and row["strength"] >= 1.5 and not row["detected"]], "none"),
+        "### Diagnoses that failed",
+        _listed([f"{name}: {why}" for name, why in failed.items()], "none"),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _made(rows: Sequence[Mapping[str, Any]], job: Mapping[str, Any], sealed: str) -> str:
+    kinds = pd.Series([row["kind"] for row in _cases(rows)]).value_counts()
+    numbers = ", ".join(f"{number} {kind}" for kind, number in kinds.items())
+    repeat = f"gyrostab prove --cases {job['cases']} --seed {job['seed']} --nulls {job['nulls']}"
+    said = [
+        f"{job['cases']} cases ({numbers}); begun {job['begun']}; {job['machine']}; code {' then '.join(job['code'])}.",
+        f"Seed {job['seed']}, to be repeated with `{repeat}`.",
+        f"SHA-256 of the list of sealed truths, taken before the first diagnosis: `{sealed}`.",
+    ]
+    if job["seed"] < TUNING:
+        said.append(f"**This seed is one for tuning (below {TUNING:,}): these figures are not for publication.**")
+    if len(job["code"]) > 1:
+        said.append(f"**The code changed {len(job['code']) - 1} times during this run: these figures are not those of one version.**")
+    return "  \n".join(said)
+
+
+def _cases(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The first row of every case."""
+    return list({row["name"]: row for row in reversed(rows)}.values())[::-1]
+
+
+def _about(row: Mapping[str, Any]) -> str:
+    held = f"{row['effect']} at {row['strength']:g}" if row["effect"] else "nothing"
+    severed = f", channel {row['severing']}" if row["severing"] else ""
+    record = f"{row['rate']:g} Hz, {row['length'] / 60:.0f} min, {100 * row['missing']:.0f} % lost"
+    return f"{row['name']} ({row['kind']}{severed}, {record}): {held}"
+
+
+def _wrong(row: Mapping[str, Any]) -> str:
+    return f"{_about(row)}; named {', '.join(row['wrong_names'])}"
+
+
+def _silent(row: Mapping[str, Any]) -> str:
+    return f"{_about(row)}; {'its diagnosis failed' if row['failed'] else 'nothing was found'}"
+
+
+def _listed(lines: Sequence[str], none: str) -> str:
+    shown = [f"- {line}" for line in lines[:_SHOWN]] + (
+        [f"- and {len(lines) - _SHOWN} more, see scores.csv"] if len(lines) > _SHOWN else []
+    )
+    return "\n".join(shown) or none

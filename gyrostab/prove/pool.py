@@ -1,0 +1,117 @@
+"""Many jobs in processes of one thread each, that end with their parent."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+from typing import Any, TypeVar
+
+from gyrostab.errors import WorkerError
+
+__all__ = ["each_in_processes"]
+
+T = TypeVar("T")
+
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def each_in_processes(
+    function: Callable[..., T], jobs: Sequence[tuple[Any, ...]], *, workers: int, told: Callable[[int], None] | None = None
+) -> list[T]:
+    """Call `function` with each of `jobs`; the results in the order of the jobs.
+
+    Parameters
+    ----------
+    function : callable
+        A function of a module.
+    jobs : sequence of tuple
+        Its arguments.
+    workers : int
+        Number of processes; 0 does the work in this one.
+    told : callable, optional
+        Is told how many jobs are done.
+
+    Raises
+    ------
+    WorkerError
+        When a process dies.
+
+    Examples
+    --------
+    >>> each_in_processes(divmod, [(7, 2), (9, 4)], workers=0)
+    [(3, 1), (2, 1)]
+    """
+    told = told or (lambda done: None)
+    if workers == 0 or not jobs:
+        return [_counted(function(*job), told, done) for done, job in enumerate(jobs, 1)]
+    with _one_thread(), _executor(min(workers, len(jobs))) as executor:
+        places = {executor.submit(function, *job): place for place, job in enumerate(jobs)}
+        results: dict[int, T] = {}
+        try:
+            for future in as_completed(places):
+                results[places[future]] = future.result()
+                told(len(results))
+        except BrokenProcessPool as error:
+            raise WorkerError(
+                "a process that worked on a case has died, perhaps for want of memory; go on with --resume and fewer --workers"
+            ) from error
+    return [results[place] for place in range(len(jobs))]
+
+
+def _counted(result: T, told: Callable[[int], None], done: int) -> T:
+    told(done)
+    return result
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let the libraries of the processes that start inside use one thread; they read this when they are loaded."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _executor(workers: int) -> Iterator[ProcessPoolExecutor]:
+    others = set(multiprocessing.active_children())
+    executor = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        raise
+    executor.shutdown()
+
+
+def _prepare() -> None:
+    """What a process does first: leave Ctrl-C to its parent, end with it, and keep dask to one thread."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    warnings.simplefilter("ignore")
+    import dask
+
+    dask.config.set(scheduler="synchronous")
+
+
+def _end_with(sentinel: int) -> None:
+    wait([sentinel])
+    os._exit(1)
