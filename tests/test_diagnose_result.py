@@ -26,6 +26,15 @@ from gyrostab.simulate import read_model, simulate
 from .command_line import call
 from .diagnosed import content, diagnosis, model, surfaces
 
+
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages of words alone, for tests that are about something else."""
+    monkeypatch.setattr("gyrostab.diagnosis.page._figures", lambda _: [])
+
+
+plain_pages = pytest.mark.usefixtures("without_figures")
+
 # ------------------------------------------------------------------------------------------------------------------- schema
 
 
@@ -115,6 +124,7 @@ def test_models_are_valid_toml_with_the_same_numbers(noise: dict[str, float], ax
     assert tomllib.loads(model_text(tables, heading="made\nby hand")) == tables
 
 
+@plain_pages
 def test_the_model_runs(tmp_path: Path):
     folder = tmp_path / "found"
     write_diagnosis(diagnosis(), folder)
@@ -129,6 +139,7 @@ def test_the_model_runs(tmp_path: Path):
 # -------------------------------------------------------------------------------------------------------------------- files
 
 
+@plain_pages
 def test_a_folder_holds_the_four_files_and_comes_back(tmp_path: Path):
     made = diagnosis()
     files = write_diagnosis(made, tmp_path / "found")
@@ -144,6 +155,7 @@ def test_a_folder_holds_the_four_files_and_comes_back(tmp_path: Path):
         )
 
 
+@plain_pages
 def test_a_folder_is_replaced_only_when_asked_and_only_when_it_is_one(tmp_path: Path):
     folder = tmp_path / "found"
     write_diagnosis(diagnosis(), folder)
@@ -160,6 +172,7 @@ def test_a_folder_is_replaced_only_when_asked_and_only_when_it_is_one(tmp_path: 
         write_diagnosis(diagnosis(), tmp_path / "not" / "there")
 
 
+@plain_pages
 def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
@@ -170,6 +183,7 @@ def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.Monkey
     assert list(tmp_path.iterdir()) == []
 
 
+@plain_pages
 def test_a_content_that_does_not_pass_is_not_written(tmp_path: Path):
     spoiled = copy.deepcopy(content())
     del spoiled["held_out"]
@@ -178,6 +192,7 @@ def test_a_content_that_does_not_pass_is_not_written(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
+@plain_pages
 @pytest.mark.parametrize("spoil", ["missing", "no JSON", "other JSON"])
 def test_what_is_no_diagnosis_is_said(tmp_path: Path, spoil: str):
     folder = tmp_path / "found"
@@ -248,6 +263,7 @@ def test_the_page_says_what_where_when_how_much_how_sure_what_else_and_what_next
         assert piece in text, piece
 
 
+@plain_pages
 def test_a_page_without_findings_says_so(tmp_path: Path):
     nothing = content() | {"verdict": "no mismatch", "mismatches": [], "effects": [], "unexplained": []}
     write_diagnosis_report(Diagnosis(nothing, surfaces(), {"noise": {}}), tmp_path / "report.html")
@@ -256,6 +272,7 @@ def test_a_page_without_findings_says_so(tmp_path: Path):
     assert "Nowhere" in text
 
 
+@plain_pages
 def test_the_page_escapes_names(tmp_path: Path):
     odd = content()
     odd["recording"]["files"] = ["<script>alert(1)</script>"]
