@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.explained import Part
+from gyrostab.diagnose.explained import Part, without_turns
 from gyrostab.diagnose.name import Claim
 from gyrostab.diagnose.null_scores import NullScores, standardise
 from gyrostab.diagnose.views import VIEWS
@@ -142,8 +142,10 @@ def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
 def _scores(reduced: xr.Dataset, after: xr.Dataset, null: NullScores) -> list[tuple[str, xr.Dataset, Array]]:
     """Views of the recording against the baseline with the effects."""
     out = []
+    turns_left_out = without_turns(reduced, after["spectrum"].transpose("axis", "block", "band").values)
     for name, score in VIEWS.items():
-        scores = score(reduced, after) if name in null.views else None
+        seen = turns_left_out if name == "distribution" else reduced
+        scores = score(seen, after) if name in null.views else None
         if scores is not None:
             out.append((name, scores, standardise(scores, null.views[name])))
     return out

@@ -12,19 +12,24 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.account import acting, spans
+from gyrostab.diagnose.explained import Part
 from gyrostab.diagnose.generics import GENERICS
 from gyrostab.diagnose.name import Claim, Naming, Unknown
 from gyrostab.diagnose.refit import Fitted, Limit
 from gyrostab.diagnose.result import effect_table
-from gyrostab.diagnose.sentences import axes_text, chance, effect_statement, mismatch_statement, plain_name, span_text
+from gyrostab.diagnose.sentences import axes_text, chance, effect_statement, mismatch_statement, named_statement, plain_name, span_text
 from gyrostab.noise import LAWS
 from gyrostab.simulate.model import Model
 
 __all__ = [
     "baseline_table",
     "chance_of_gain",
+    "claim_tables",
+    "effect_tables",
     "iso",
+    "limit_tables",
     "mismatch_tables",
+    "model_tables",
     "recording_table",
     "surfaces_with_blocks",
     "unknown_tables",
@@ -36,6 +41,12 @@ _TAIL = 0.25
 _LEAST_P = 1e-12
 #: Generic -> view in which it is told.
 _GENERIC_VIEW = {"~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution"}
+#: Where an effect shows -> view in which it is told.
+_PART_VIEW = {
+    "mean": "mean", "wander": "mean", "power": "davar", "transfer": "davar", "cross": "cross_axis", "marks": "distribution",
+    "line": "spectrum", "order": "spectrum", "phase_locked": "spectrum",
+}  # fmt: skip
+_BUMP = 0.371  # averaging time times frequency where the Allan variance of a sine is largest
 _MOST_LINES = 4000
 
 
@@ -105,6 +116,48 @@ def chance_of_gain(best: Array, gain: float) -> float:
     return max(_TAIL * math.exp(-(gain - start) / scale), _LEAST_P)
 
 
+def claim_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Mismatches that only naming saw: where a named effect acts that explains none of those known, by its strongest part."""
+    out: list[dict[str, Any]] = []
+    begin, end = reduced["begin"].values, reduced["end"].values
+    for claim in naming.claims:
+        if any(claim.effect in box["explained_by"] and set(box["axes"]) & set(claim.axes) for box in known):
+            continue
+        strongest = max(claim.parts, key=lambda part: part.gain)
+        view = _PART_VIEW.get(strongest.candidate.view, "davar")
+        low, high = _taus(strongest, view, reduced)
+        p_value = chance_of_gain(naming.null_best, claim.gain)
+        for first, last in spans(acting(claim, begin.size), begin, end):
+            when = span_text(first, last, float(end[-1]))
+            out.append(
+                {
+                    "id": len(known) + len(out) + 1,
+                    "view": view,
+                    "axes": list(claim.axes),
+                    "start": iso(reduced, first),
+                    "end": iso(reduced, last),
+                    "tau_min_s": low,
+                    "tau_max_s": high,
+                    "ratio": None,
+                    "p_value": p_value,
+                    "explained_by": [claim.effect],
+                    "statement": named_statement(view, claim.effect, claim.axes, when, p_value),
+                }
+            )
+    return out
+
+
+def _taus(part: Part, view: str, reduced: xr.Dataset) -> tuple[float, float]:
+    """Averaging times [s] at which a part of an effect shows: those of its line, of block means, or those within a block."""
+    block, whole = float(reduced.attrs["block_s"]), float(reduced["end"].values[-1])
+    if part.candidate.view == "line" and part.place >= 0:
+        tau = _BUMP / float(reduced["line_frequency"].values[part.place])
+        return tau, tau
+    if view == "mean":
+        return block, whole / 2.0
+    return 1.0 / float(reduced.attrs["sampling_rate_hz"]), block
+
+
 def unknown_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Mismatches that only naming saw: what no effect explains, where no box that is left says so already."""
     out: list[dict[str, Any]] = []
@@ -140,15 +193,14 @@ def _unknown_table(one: Unknown, naming: Naming, reduced: xr.Dataset, number: in
 def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[str, Any]]:
     """The named effects, the strongest first.
 
-    The standard error of a held-out gain is the one that the logarithm of a likelihood ratio has where the model is right: the root of
-    twice the gain.
+    An effect with different numbers on several axes is one claim in as many tables, each with the gain of the claim, which is what
+    passed the threshold. The standard error of a held-out gain is the one that the logarithm of a likelihood ratio has where the
+    model is right: the root of twice the gain.
     """
     begin, end = reduced["begin"].values, reduced["end"].values
     out = []
     for one in fitted:
         claim = one.claim
-        mine = sum(max(part.gain, 0.0) for part in claim.parts if set(part.row) & set(one.axes))
-        gain = claim.gain if set(one.axes) == set(claim.axes) else mine
         when = spans(acting(claim, begin.size), begin, end)
         whole = float(end[-1])
         out.append(
@@ -158,7 +210,7 @@ def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[st
                 "driver": ",".join(filter(None, claim.driver)) or None,
                 "intervals": [[iso(reduced, low), iso(reduced, high)] for low, high in when],
                 "parameters": {name: asdict(estimate) for name, estimate in one.parameters.items()},
-                "held_out_gain": {"nats": gain, "stderr": math.sqrt(2.0 * max(gain, 0.0)), "threshold": claim.threshold},
+                "held_out_gain": {"nats": claim.gain, "stderr": math.sqrt(2.0 * max(claim.gain, 0.0)), "threshold": claim.threshold},
                 "alternatives": list(claim.alternatives),
                 "statement": effect_statement(
                     one.say(),

@@ -14,6 +14,7 @@ from gyrostab.diagnose.account import explanations
 from gyrostab.diagnose.baseline import calibrate, from_model, from_simulation
 from gyrostab.diagnose.content import (
     baseline_table,
+    claim_tables,
     effect_tables,
     limit_tables,
     mismatch_tables,
@@ -210,6 +211,7 @@ def _concluded(
     after = predicted(naming, baseline) if naming.claims else baseline
     held = held_out(reduced, baseline, (lambda known: predicted(naming, baseline, known)) if naming.claims else baseline)
     mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level))
+    mismatches += claim_tables(naming, reduced, mismatches)
     mismatches += unknown_tables(naming, reduced, mismatches)
     unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
     content = {

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, harmonic_sets, order_columns, pair_rows, power_column
 from gyrostab.diagnose.gain import noise_columns
+from gyrostab.physics.phase import fold
 
-__all__ = ["Part", "explain_away", "mean_columns", "reweighted", "take_part"]
+__all__ = ["Part", "explain_away", "mean_columns", "reweighted", "take_part", "without_turns"]
 
 Array = NDArray[np.float64]
 _LINE_REACH = 3  # lines on each side of one that belong to it
 _FEW = 0.5  # of the blocks at most may be masked
+_TURN = 0.2  # change of the logarithm of the noise power from block to block
 _FLOOR = 0.2  # of the expected power, below which no fit goes
 
 
@@ -152,7 +154,23 @@ def _free_shape(state: State, axis: str) -> State:
 
 def _profile(state: State, part: Part) -> State:
     state = state.with_columns("phase_locked", part.row[0], list(part.variant.design))
+    if "ramp_turns" in state.reduced:
+        state = state.with_columns("line", "all", [_comb(state)])
     return _free_shape(state, part.row[0])
+
+
+def _comb(state: State) -> NDArray[np.bool_]:
+    """Lines at the multiples of the turns of the ramp, folded as samples see them."""
+    lines, rate = state.reduced["line_frequency"].values, float(state.reduced.attrs["sampling_rate_hz"])
+    turns = np.abs(state.reduced["ramp_turns"].values)
+    turns = turns[np.isfinite(turns)]
+    if not turns.size:
+        return np.zeros(lines.size, np.bool_)
+    number = np.arange(1, max(2, int(rate / max(turns.mean(), lines[0]))))
+    low, high = (fold(number * one, rate) for one in (turns.min(), turns.max()))
+    reach = _LINE_REACH * lines[0]
+    near = (lines[:, None] >= np.minimum(low, high) - reach) & (lines[:, None] <= np.maximum(low, high) + reach)
+    return np.asarray(near.any(axis=1))
 
 
 def _transfer(state: State, part: Part) -> State:
@@ -230,7 +248,33 @@ def reweighted(state: State, *, rounds: int = 4) -> State:
         named = state.given.get(("power", axis))
         if named:
             weight[row] = _fit(state, row, axis, np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1), rounds)
-    return replace(state, weight=weight)
+    return replace(state, weight=weight, reduced=without_turns(state.reduced, weight))
+
+
+def without_turns(reduced: xr.Dataset, expected: Array) -> xr.Dataset:
+    """The record without the kurtosis and outliers that a changing level of the noise explains.
+
+    Two levels in one block have tails that neither of them has; and noise of another level than usual has another kurtosis, since
+    that of rounding gets lost in what is louder.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+    expected : ndarray, shape (axis, block, band)
+        Expected power.
+    """
+    level = np.log(expected @ (reduced["band_high"].values - reduced["band_low"].values))
+    step = np.abs(np.diff(level, axis=1)) > _TURN
+    turns = np.pad(step, ((0, 0), (1, 0))) | np.pad(step, ((0, 0), (0, 1)))
+    unusual = turns | (np.abs(level - np.median(level, axis=1, keepdims=True)) > _TURN)
+    left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
+    return reduced.assign(
+        {
+            name: reduced[name].where(xr.DataArray(~where, dims=("axis", "block")), other)
+            for name, (where, other) in left_out.items()
+            if name in reduced
+        }
+    )
 
 
 def _fit(state: State, row: int, axis: str, named: Array, rounds: int) -> Array:

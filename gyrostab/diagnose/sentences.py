@@ -17,6 +17,7 @@ __all__ = [
     "effect_statement",
     "length_text",
     "mismatch_statement",
+    "named_statement",
     "next_measurement",
     "plain_name",
     "span_text",
@@ -234,6 +235,29 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
     told = _MARKS.get(what, "an unusual distribution of its samples")
     return f"{begin} {'has' if one else 'have'} {told} {when} ({sure})."
 
+
+def named_statement(view: str, effect: str, axes: Sequence[str], when: str, p_value: float) -> str:
+    """One sentence on what shows only when an effect says where to look.
+
+    Examples
+    --------
+    >>> named_statement("mean", "shupe", ["y"], "over the whole record", 0.004)
+    'The mean rate of axis y differs over the whole record, in no single place, but taken together as a bias that follows the
+     rate of change of temperature (Shupe effect) would have it (noise alone does that in 1 of 250 such records).'
+    """
+    what = _SHOWN.get(view, "The noise")
+    return (
+        f"{what} of {axes_text(axes)} differs {when}, in no single place, but taken together as {plain_name(effect)} would have it "
+        f"({chance(p_value)})."
+    )
+
+
+_SHOWN = {
+    "mean": "The mean rate",
+    "cross_axis": "The covariance",
+    "spectrum": "The spectrum",
+    "distribution": "The distribution of the samples",
+}
 
 _MARKS = {
     "outliers": "samples that jump out",

@@ -23,7 +23,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     Parameters
     ----------
     reduced, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects; the bands are weighed by its spectrum.
+        Recording or null records, and what the simulation expects: the bands are weighed by its spectrum, and a ``cross`` (pair,
+        block, band) that the axes share by it is taken off.
 
     Returns
     -------
@@ -73,6 +74,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 def _coherency(reduced: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows) -> tuple[Complex, Array]:
     """Coherency of each pair by (record), pair, window, band and over all bands last, and the complex ordinates in each."""
     cross = values_of(reduced, "cross", "pair", "block", "band")
+    if "cross" in baseline:
+        cross = cross - values_of(baseline, "cross", "pair", "block", "band")
     power, shape = values_of(reduced, "power", "axis", "block", "band"), values_of(reduced, "shape", "axis", "block", "band")
     spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
     with np.errstate(divide="ignore", invalid="ignore"):

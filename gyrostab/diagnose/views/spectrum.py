@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.views.cells import Array, Windows, cube_root_score, values_of, view_dataset
+from gyrostab.diagnose.views.cells import Array, Windows, cube_root_score, over_windows, values_of, view_dataset
 
 __all__ = ["score"]
 
@@ -40,6 +40,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         whole = flat.sum(axis=-2, keepdims=True)
         count = np.concatenate([each, each.sum(axis=-2, keepdims=True)], axis=-2)
         flat = np.concatenate([flat, whole], axis=-2) / count
+        count = count * _evenness(reduced, windows)
         around = _surroundings(flat)
         ratio = flat / around
     # a sum over lines, which only a recording needs
@@ -65,6 +66,22 @@ def _parts(reduced: xr.Dataset) -> Windows:
     parts, blocks = reduced.sizes["part"], reduced.sizes["block"]
     edge = np.rint(np.linspace(0, blocks, parts + 1)).astype(np.int64)
     return Windows(np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), blocks))
+
+
+def _evenness(reduced: xr.Dataset, windows: Windows) -> Array:
+    """Blocks that a mean is as good as, over those in it, by window and line: one loud block among quiet ones scatters as one alone."""
+    power, shape = (values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape"))
+    there = np.isfinite(power) & (shape > 0)
+    power, one = np.where(there, power, 0.0), there.astype(float)
+    square = np.where(there, power**2 * shape / (1.0 + shape), 0.0)
+    count, first, second = (over_windows(part, windows) for part in (one, power, square))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        even = np.where(second > 0, first**2 / (count * second), 1.0)
+    bands, lines = np.log(reduced["frequency"].values), np.log(reduced["line_frequency"].values)
+    place = np.clip(np.searchsorted(bands, lines), 1, bands.size - 1)
+    share = np.clip((lines - bands[place - 1]) / (bands[place] - bands[place - 1]), 0.0, 1.0)
+    even = np.minimum(even, 1.0)
+    return np.asarray(even[..., place - 1] * (1.0 - share) + even[..., place] * share)
 
 
 def _expected(baseline: xr.Dataset, frequency: Array) -> Array:
