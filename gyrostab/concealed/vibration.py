@@ -112,14 +112,12 @@ def folded_psd(frequency: Array, *, rate: float, kind: str, low: float, high: fl
     sos = _band(low, high)
     level = 1.0 / (FAST * _power(sos, low, high))
     taps = decimator_taps(rate, kind)
-    total = np.zeros_like(frequency)
-    for k in range(round(FAST / rate)):
-        alias = (frequency + k * rate) % FAST
-        gain = np.abs(signal.freqz_sos(sos, worN=alias, fs=FAST)[1]) ** 2 * np.abs(signal.freqz(taps, worN=alias, fs=FAST)[1]) ** 2
-        if mount is not None:
-            gain = gain * np.abs(signal.freqz(*mount, worN=alias, fs=FAST)[1]) ** 2
-        total += gain * level
-    return np.asarray(total)
+    alias = (np.asarray(frequency)[None, :] + rate * np.arange(round(FAST / rate))[:, None]) % FAST
+    flat = alias.ravel()
+    gain = np.abs(signal.freqz_sos(sos, worN=flat, fs=FAST)[1]) ** 2 * np.abs(signal.freqz(taps, worN=flat, fs=FAST)[1]) ** 2
+    if mount is not None:
+        gain = gain * np.abs(signal.freqz(*mount, worN=flat, fs=FAST)[1]) ** 2
+    return np.asarray(level * gain.reshape(alias.shape).sum(axis=0))
 
 
 def rectify(rms: Array, *, exponent: float, saturation: float) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.concealed.floor import white_level
-from gyrostab.concealed.naive import allan_band, allan_variance
+from gyrostab.concealed.naive import allan_band, band_excess
 from gyrostab.concealed.world import AXES, Effect, World
 
 __all__ = ["FAINT", "is_buried", "trace_visibility"]
@@ -73,8 +73,7 @@ def is_buried(world: World, effects: Sequence[Effect], record: Array, *, rng: np
         if axis not in touched:
             continue
         band = allan_band(noise=noise, rate=world.rate, missing=np.isnan(row), rng=rng, nulls=nulls, flicker=world.flicker)
-        z = (np.log(allan_variance(row, band["factors"])) - band["mean"]) / band["sd"]
-        allan[axis] = float(np.abs(z).max()) / band["limit"]
+        allan[axis] = band_excess(row, band) / band["limit"]
         if allan[axis] >= 1:
             break
     return {"buried": bool(all(value < 1 for value in allan.values())), **worst, "allan": allan}
