@@ -50,7 +50,7 @@ CATALOGUE: dict[str, Entry] = {
 STRANGE: dict[str, Entry] = {
     "breathing_noise": Entry(strange.breathing_noise),
     "chirped_line": Entry(strange.chirped_line),
-    "vibration_memory": Entry(strange.vibration_memory),
+    "slow_memory": Entry(strange.slow_memory),
     "three_levels": Entry(strange.three_levels),
     "informative_gaps": Entry(strange.informative_gaps),
 }

@@ -12,7 +12,7 @@ from gyrostab.concealed.environment import lag
 from gyrostab.concealed.shapes import mean_effect, named, on_axes, variance_effect
 from gyrostab.concealed.world import Effect, World, stream, to_samples
 
-__all__ = ["breathing_noise", "chirped_line", "informative_gaps", "three_levels", "vibration_memory"]
+__all__ = ["breathing_noise", "chirped_line", "informative_gaps", "slow_memory", "three_levels"]
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ def chirped_line(world: World, rng: np.random.Generator, *, strength: float) -> 
     )
 
 
-def vibration_memory(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+def slow_memory(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """A glue that keeps a dose of something unseen and lets it go as a power of time: no level, no rate, no start explains it."""
     dose = rng.random(world.temperature.size) < 4.0 / world.seconds
     dose[int(rng.uniform(0.1, 0.6) * dose.size)] = True
@@ -68,7 +68,7 @@ def vibration_memory(world: World, rng: np.random.Generator, *, strength: float)
         to_samples(world, shape),
         on_axes(rng),
         strength=strength,
-        name="vibration_memory",
+        name="slow_memory",
         driver=None,
         form="slow rise and fall, power 0.4 of time, after hidden doses",
         differs=True,
