@@ -132,7 +132,7 @@ def _diagnose(
     records = _records(reduced, baseline, nulls, seed)
     progress("comparing", 0)
     null = null_scores(baseline, records())
-    found = locate(reduced, baseline, null, level=level)
+    found = locate(reduced, baseline, null, level=level / 2.0)  # the other half is for the names
     progress("naming", 0)
     naming = name_effects(reduced, baseline, records(), level=level / 2.0, seed=seed, progress=progress)
     progress("fitting", 0)
@@ -210,7 +210,7 @@ def _concluded(
     fitted = fit_claims(naming, baseline)
     after = predicted(naming, baseline) if naming.claims else baseline
     held = held_out(reduced, baseline, (lambda known: predicted(naming, baseline, known)) if naming.claims else baseline)
-    mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level))
+    mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level / 2.0))
     mismatches += claim_tables(naming, reduced, mismatches)
     mismatches += unknown_tables(naming, reduced, mismatches)
     unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
