@@ -70,6 +70,7 @@ class Accumulator:
             self.ramp = None
         self.profile_sums = np.zeros((self.axes, blocks, PHASES)) if self.ramp is not None else None
         self.profile_counts = np.zeros((self.axes, blocks, PHASES), np.int64)
+        self.ramp_turns = np.full(blocks, np.nan) if self.ramp is not None else None
 
     def add(self, stretch: Stretch) -> None:
         """Take in some blocks."""
@@ -88,9 +89,20 @@ class Accumulator:
             self._orders(part, centred[: self.axes])
         if self.profile_sums is not None:
             phase = stretch.values[self.ramp]
+            self._turn_ramp(part, phase)
             for row in range(self.axes):
                 sums, counts = self.profile_sums[row, part], self.profile_counts[row, part]
                 kernel.phase_profile(centred[row], present[row], phase, *self.ramp_range, sums, counts)
+
+    def _turn_ramp(self, part: slice, phase: Array) -> None:
+        """How often the ramp turns in each block, from the moves between samples, none of them half a turn."""
+        assert self.ramp_turns is not None
+        low, high = self.ramp_range
+        moved = np.diff(phase, axis=1) / (high - low)
+        moved -= np.round(moved)
+        there = np.isfinite(moved)
+        total = np.where(there, moved, 0.0).sum(axis=1)
+        self.ramp_turns[part] = np.where(there.any(axis=1), total / np.maximum(there.sum(axis=1), 1), np.nan) * self.rate
 
     def _spectra(self, part: slice, centred: Array, present: NDArray[np.bool_]) -> None:
         inside = slice(1, kernel.ordinates(self.length) + 1)

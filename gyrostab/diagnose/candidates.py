@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.designs import BUILDERS, Candidate, Variant, term_density
+from gyrostab.diagnose.tallies import OF_LATTICE, coarse_lattice
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction, Windows
@@ -72,6 +73,7 @@ def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         gaps=spans("gap"),
         restarts=spans("restart"),
         phase=(np.arange(reduced.sizes["phase"]) + 0.5) / reduced.sizes["phase"] if "profile" in reduced else np.empty(0),
+        turns=reduced["ramp_turns"].values if "ramp_turns" in reduced else np.empty(0),
     )
 
 
@@ -121,6 +123,9 @@ def effect_candidates(reduced: xr.Dataset, coefficient: xr.DataArray) -> tuple[l
             continue
         made: list[Candidate] = []
         said = ""
+        if _by_lattice(kind, reduced):
+            reasons[name] = "not identifiable: the lattice of values is too coarse"
+            continue
         for drivers in _drivers(kind, reduced, units):
             more, why = _of_kind(kind, reduced, drivers, coefficient)
             made += more
@@ -129,6 +134,14 @@ def effect_candidates(reduced: xr.Dataset, coefficient: xr.DataArray) -> tuple[l
         if not made:
             reasons[name] = f"not identifiable: {said or 'it leaves no trace in means, spectra and distribution of this record'}"
     return found, reasons
+
+
+def _by_lattice(kind: type[Effect], reduced: xr.Dataset) -> bool:
+    """The effect is told by statistics that, on every axis of this record, are those of the lattice of values."""
+    if kind.channels or not coarse_lattice(reduced).all():
+        return False
+    marks = kind.example().explain(windows_of(reduced, {})).marks
+    return bool(marks) and set(marks) <= set(OF_LATTICE)
 
 
 # ------------------------------------------------------------------------------------------------------------- channels

@@ -37,6 +37,7 @@ _ROW = 2.0  # nats that an axis must bring to be named with the others
 _ROUNDS = 10
 _LEAST_NULLS = 40
 _SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
+_LOCKED = ("order", "phase_locked")
 _TAIL = 0.25
 
 
@@ -198,6 +199,8 @@ class _Search:
         passing = [key for key in ranked if _sum(parts[key]) > need[key]]
         odd = [key for key in passing if parts[key][0].candidate.view == "marks" and not key.startswith("~")]
         passing = odd or passing  # odd samples first: they raise powers and means too, and not the other way round
+        if any(parts[key][0].candidate.view in _LOCKED for key in passing):
+            passing = [key for key in passing if parts[key][0].candidate.view != "line"]  # what is locked to a channel makes lines
         if not passing:
             return None
         top = _sum(parts[passing[0]])

@@ -103,6 +103,8 @@ def _common(apart: Array, fine: float) -> float:
         near = whole < step / (16.0 * fine)  # farther ones may be off by their number times the error of the step
         rest = np.abs(apart - whole * step)
         wrong = near & (rest > 2.0 * fine * (1.0 + whole))
+        if not near.any():
+            return 0.0
         if not wrong.any():
             return float(apart[near].sum() / whole[near].sum())
         step = float(rest[wrong].min())

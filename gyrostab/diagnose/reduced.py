@@ -214,6 +214,10 @@ def _locked(work: Accumulator) -> dict[str, Any]:
         dims = ("axis", "block", "phase")
         found["profile"] = (dims, profile, _named("mean rate less the block's mean, by phase of the ramp", _RATE))
         found["profile_samples"] = (dims, work.profile_counts, _named("samples of each mean", "1"))
+        attrs = _named("turns of the ramp in a second, negative where it falls", "Hz") | dict(
+            zip(("low", "high"), work.ramp_range, strict=True)
+        )
+        found["ramp_turns"] = ("block", work.ramp_turns, attrs)
     return found
 
 

@@ -138,7 +138,7 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
         estimates[name] = _estimate(mean, sd, unit, positive=_positive(kind, name))
         _put(values, name, mean, axes)
     values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
-    values |= _words(claim, by_view[view][0], values)
+    values |= _words(claim, by_view[view][0], state)
     return Fitted(claim, axes, estimates, _instance(kind, values, axes, claim.driver))
 
 
@@ -156,10 +156,13 @@ def _put(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...])
     known[axes.index(axis)] = value
 
 
-def _words(claim: Claim, part: Part, values: Mapping[str, Any]) -> dict[str, Any]:
+def _words(claim: Claim, part: Part, state: State) -> dict[str, Any]:
     """What the model needs beside the numbers."""
     if claim.effect == "rotation_line":
         return {"harmonics": 1.0}
+    if claim.effect == "feedback_reset" and "ramp_turns" in state.reduced:
+        low, high = (float(state.reduced["ramp_turns"].attrs[name]) for name in ("low", "high"))
+        return {"phase": "channel", "full": float(part.variant.values.get("full", 1.0)) * (high - low)}
     if claim.effect == "held_samples":
         return {"fill": "zero" if part.variant.columns[0] == "zeros" else "repeat"}
     if claim.effect == "spikes":
@@ -329,7 +332,7 @@ def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Nam
 def _line(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
     name = {"real_motion": "sway"}.get(parts[0].candidate.effect, parts[0].variant.columns[0])
     out: dict[str, tuple[float, float]] = {}
-    for part in parts:
+    for part in sorted(parts, key=lambda part: part.gain):  # of several lines of an axis the strongest
         amplitude, frequency = line_size(state.reduced, part.row[0], part.place)
         label = "" if len(axes) == 1 or name == "sway" else f".{part.row[0]}"
         out[f"{name}{label}"], out["frequency"] = amplitude, frequency

@@ -13,7 +13,7 @@ from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, cell_factors, cells_of, drawn, view_rows
 from gyrostab.diagnose.folds import fold_subsets
 from gyrostab.diagnose.gain import mean_factors, score
-from gyrostab.diagnose.tallies import Expected, count_gains, expected_counts, kurtosis_gains, line_gains
+from gyrostab.diagnose.tallies import OF_LATTICE, Expected, coarse_lattice, count_gains, expected_counts, kurtosis_gains, line_gains
 
 __all__ = ["Found", "Tallies", "gains", "together", "totals"]
 
@@ -168,11 +168,12 @@ def _cells(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
 def _marks(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray, tallies: Tallies) -> list[Found]:
     subsets = fold_subsets(folds)
     rows = [(axis,) for axis in state.axes]
+    coarse = coarse_lattice(state.reduced)
     out = []
     for each in group:
         gain, best = [], []
         for variant in each.variants:
-            parts = [_mark(name, data, state, subsets, tallies) for name in variant.columns]
+            parts = [np.where(coarse & (name in OF_LATTICE), 0.0, _mark(name, data, state, subsets, tallies)) for name in variant.columns]
             gain.append(np.max(parts, axis=0))
         place = np.argmax([one[0] for one in gain], axis=0)
         best = [each.variants[int(number)] for number in place]

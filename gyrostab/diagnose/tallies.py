@@ -11,13 +11,57 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.folds import FOLDS
 
-__all__ = ["COUNTS", "Expected", "count_gains", "expected_counts", "kurtosis_gains", "line_gains", "local_level"]
+__all__ = [
+    "COUNTS",
+    "OF_LATTICE",
+    "Expected",
+    "coarse_lattice",
+    "count_gains",
+    "expected_counts",
+    "kurtosis_gains",
+    "line_gains",
+    "local_level",
+]
 
 Array = NDArray[Any]
 #: Counts of blocks that effects raise.
 COUNTS = ("outliers", "repeats", "extremes", "zeros")
+#: Statistics of the distribution that a coarse lattice makes by itself.
+OF_LATTICE = ("repeats", "extremes", "zeros", "kurtosis")
+_COARSE, _STILL = 0.2, 0.1  # step in scatters of the samples; share of the blocks that tell the scatter at rest
 _SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
 _NEIGHBOURS = 25  # lines on each side that tell the level
+
+
+def coarse_lattice(reduced: xr.Dataset) -> NDArray[np.bool_]:
+    """Axes whose lattice is so coarse that equal samples, zeros and tails are its own, and tell of nothing else.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        Recording or null records.
+
+    Returns
+    -------
+    ndarray of bool, shape (axis,)
+
+    Examples
+    --------
+    >>> one = {"lattice": ("axis", [3.0, 0.1]), "power": (("axis", "block", "band"), np.full((2, 9, 1), 0.5))}
+    >>> coarse_lattice(xr.Dataset(one, coords={"band_low": ("band", [0.0]), "band_high": ("band", [100.0])}))
+    array([ True, False])
+    """
+    if "lattice" not in reduced:
+        return np.zeros(reduced.sizes["axis"], np.bool_)
+    return np.asarray(reduced["lattice"].values > _COARSE * still_scatter(reduced))
+
+
+def still_scatter(reduced: xr.Dataset) -> NDArray[np.float64]:
+    """Scatter of the samples of every axis in its quiet blocks [degree hour-1]; inf without any."""
+    width = reduced["band_high"].values - reduced["band_low"].values
+    power = reduced["power"].transpose("axis", ..., "band").values
+    square = 2.0 * (power @ width).reshape(len(power), -1)
+    return np.sqrt([np.quantile(row[np.isfinite(row)], _STILL) if np.isfinite(row).any() else np.inf for row in square])
 
 
 class Expected:

@@ -186,8 +186,18 @@ class FeedbackReset(Effect):
         return before * samples * -math.expm1(-1.0 / samples) + size * (resets - ages), left[:, -1:]
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Diameters of coils, and times of the tail about the sampling interval."""
-        return {"diameter": np.geomspace(0.03, 0.3, 8), "decay": np.array([0.5, 2.0, 8.0]) / windows.rate}
+        """Times of the tail about the sampling interval; diameters of coils, or what a recorded ramp says of it and of its sign."""
+        decay = np.array([0.5, 1.0, 2.0, 4.0, 8.0]) / windows.rate
+        turns = float(np.nanmean(windows.turns)) if np.isfinite(windows.turns).any() else 0.0
+        rates = np.array([np.nanmean(windows.own[axis]) for axis in windows.axes if np.isfinite(windows.own[axis]).any()])
+        rates = rates[rates != 0.0]
+        if turns == 0.0 or not rates.size:
+            return {"diameter": np.geomspace(0.03, 0.3, 8), "decay": decay}
+        diameter = self.index * self.wavelength * np.abs(turns * _NRAD_PER_S / rates)
+        known = next(one for one in self.parameters() if one.name == "diameter")
+        likely = diameter[(diameter >= known.low) & (diameter <= known.high)]
+        full = np.unique(np.sign(turns * rates))
+        return {"diameter": likely if likely.size else np.array([self.diameter]), "decay": decay, "full": full}
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means in proportion to the rate; the comb and where its lines show, at the rate of the first axis."""
@@ -212,6 +222,8 @@ class FeedbackReset(Effect):
         if not windows.phase.size:
             return {}
         own = np.stack([windows.own[axis] for axis in windows.axes])
+        if not np.isfinite(own).any():
+            return {}
         moved = np.nanmedian(own) / (self.turn * _NRAD_PER_S * windows.rate)
         step = max(abs(moved), 1.0 / windows.phase.size)
         since = windows.phase if moved * self.full >= 0 else 1.0 - windows.phase

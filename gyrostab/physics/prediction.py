@@ -35,6 +35,8 @@ class Windows:
         As in `Setup`, in seconds.
     phase : ndarray, shape (phase,)
         Centres of the bins of the ramp's phase, from 0 to 1; empty where no ramp was recorded.
+    turns : ndarray, shape (window,)
+        Turns of the ramp in a second, negative where it falls [Hz]; empty where no ramp was recorded.
     """
 
     begin: Array
@@ -47,6 +49,7 @@ class Windows:
     gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
     restarts: Array = field(default_factory=lambda: np.empty((0, 2)))
     phase: Array = field(default_factory=lambda: np.empty(0))
+    turns: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def centre(self) -> Array:

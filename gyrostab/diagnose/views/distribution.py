@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.tallies import OF_LATTICE, coarse_lattice
 from gyrostab.diagnose.views.cells import Array, over_windows, values_of, view_dataset, window_set
 
 __all__ = ["COUNTS", "LENGTHS", "score"]
@@ -22,7 +23,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Score counts and kurtosis in windows of three lengths and of the whole record.
 
     The counts are made to scatter alike by Anscombe's root; what is to be expected of them the null records say, so that
-    only differences between records of one kind mean something.
+    only differences between records of one kind mean something. On a coarse lattice most of them are those of the lattice, and
+    are left out.
 
     Parameters
     ----------
@@ -48,13 +50,16 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         mean = over_windows(excess[..., None], windows) / n
     rate = float(reduced.attrs["sampling_rate_hz"])
     number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
+    z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
+    of_lattice = np.array([name in OF_LATTICE for name in (*COUNTS, "kurtosis")])
+    z = np.where(coarse_lattice(reduced)[:, None, None] & of_lattice, np.nan, z)
     return view_dataset(
         "distribution",
         reduced,
         rows=[str(axis) for axis in reduced["axis"].values],
         windows=windows,
         columns={"what": [*COUNTS, "kurtosis"], "tau_min_s": 1.0 / rate, "tau_max_s": 1.0 / rate, "floor": _FLOOR},
-        z=np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1),
+        z=z,
         ratio=number,
         estimate=number,
     )
