@@ -224,7 +224,7 @@ def _marks(state: State, part: Part) -> State:
     for variable in ("mean", "power"):
         reduced[variable] = reduced[variable].where(keep | ~here)
     if "cross" in reduced:
-        touched = xr.DataArray([axis in pair for pair in pair_rows(reduced)], dims="pair")
+        touched = xr.DataArray(np.array([axis in pair for pair in pair_rows(reduced)], dtype=bool), dims="pair")
         reduced["cross"] = reduced["cross"].where(keep | ~touched)
     return replace(state, reduced=reduced)
 

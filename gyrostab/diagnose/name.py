@@ -37,7 +37,7 @@ _ROW = 2.0  # nats that an axis must bring to be named with the others
 _ROUNDS = 10
 _LEAST_NULLS = 40
 _SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
-_LOCKED = ("order", "phase_locked")
+_LOCKED = ("order", "phase_locked", "transfer")
 _TAIL = 0.25
 
 

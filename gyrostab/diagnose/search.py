@@ -13,7 +13,16 @@ from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, cell_factors, cells_of, drawn, view_rows
 from gyrostab.diagnose.folds import fold_subsets
 from gyrostab.diagnose.gain import mean_factors, score
-from gyrostab.diagnose.tallies import OF_LATTICE, Expected, coarse_lattice, count_gains, expected_counts, kurtosis_gains, line_gains
+from gyrostab.diagnose.tallies import (
+    OF_LATTICE,
+    Expected,
+    coarse_lattice,
+    count_gains,
+    expected_counts,
+    kurtosis_gains,
+    line_gains,
+    still_scatter,
+)
 
 __all__ = ["Found", "Tallies", "gains", "together", "totals"]
 
@@ -200,10 +209,8 @@ _COARSE = 0.1  # of the scatter of the samples: a finer lattice is lost in it
 def _lattice(state: State) -> Array:
     """Samples on a lattice that is coarse enough to matter, one nat each: noise without one never stands on it."""
     reduced = state.reduced
-    width = (reduced["band_high"] - reduced["band_low"]).values
-    spread = np.sqrt(np.nanmean((reduced["power"].values * width).sum(axis=-1), axis=-1) * 2.0)
-    step = reduced["lattice"].values
-    return np.where(step > _COARSE * spread, reduced["samples"].values.sum(axis=1), 0.0).astype(np.float64)
+    matters = reduced["lattice"].values > _COARSE * still_scatter(reduced)
+    return np.where(matters, reduced["samples"].values.sum(axis=1), 0.0).astype(np.float64)
 
 
 def _lines(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[Found]:

@@ -20,6 +20,7 @@ STRUCTURAL: dict[str, tuple[str, ...]] = {
 #: Effect -> largest size that is plausible, by parameter.
 _LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
 _SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
+_COMB = 3  # lines that may be one comb
 _MOVING = 1.5  # times the expected power, from which on an axis moves
 _LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
 
@@ -51,6 +52,8 @@ def structural(effect: str, parts: Sequence[Part], state: State, tried: Collecti
     """Effects that are part of the answer by their nature."""
     out = list(STRUCTURAL.get(effect, ()))
     reduced = state.reduced
+    if effect == "spectral_line" and "profile" not in reduced and len({part.place for part in parts}) >= _COMB:
+        out.append("feedback_reset")
     if effect == "vibration_rectification":
         vibration = reduced[f"channel_{parts[0].candidate.driver[0]}"].values
         good = np.isfinite(vibration)

@@ -21,6 +21,7 @@ __all__ = [
     "kurtosis_gains",
     "line_gains",
     "local_level",
+    "still_scatter",
 ]
 
 Array = NDArray[Any]

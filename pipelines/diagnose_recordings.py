@@ -1,0 +1,58 @@
+"""Diagnose every recording of diagnose_recordings.toml, and print a table of what is named: python pipelines/diagnose_recordings.py [NAME ...]."""
+
+import os
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+import gyrostab
+from gyrostab.diagnose.baseline import calibrate
+from gyrostab.diagnose.reduced import reduce_log
+
+ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+TAUS = "0.005s,0.01s,0.02s,0.04s,0.08s,0.16s,0.32s,0.5s,1s,5s,10s"
+
+
+def log_of(name, start=0.0, end=np.inf):
+    """Read a recording, from `start` to `end` seconds."""
+    entry = PLAN["recording"][name]
+    log = gyrostab.regularise(gyrostab.read_log(entry["files"], **entry["read"]))
+    rate = log.attrs["sampling_rate_hz"]
+    return log.isel(time=slice(round(start * rate), round(min(end * rate, log.sizes["time"]))))
+
+
+def row(name, found):
+    """One row of the table: verdict, and each effect with its axes and what it gains."""
+    named = [f"{one['name']} ({', '.join(one['axes'])}): {one['held_out_gain']['nats']:.0f}" for one in found.effects]
+    held = found.content["held_out"]
+    return f"| {name} | {found.verdict} | {'; '.join(named)} | {held['coverage95_before']:.0%} | {held['coverage95_after']:.0%} |"
+
+
+def halves(name, *, nulls=400):
+    """Fit a simulation to the first half, without and with the effects, and compare its Allan variance with that of the second half."""
+    whole = log_of(name)
+    seconds = whole.sizes["time"] / whole.attrs["sampling_rate_hz"]
+    first, second = log_of(name, end=seconds / 2), log_of(name, start=seconds / 2)
+    model = gyrostab.diagnose(first, nulls=nulls).model
+    resets = [one for one in model["effect"] if one["name"] == "feedback_reset"]
+    quiet = {axis: dict.fromkeys(terms, 0.0) for axis, terms in model["noise"].items()}
+    clean = first.assign(rate=first["rate"] - gyrostab.simulate({"noise": quiet, "effect": resets}, like=first)["rate"].values)
+    rest = calibrate(reduce_log(clean.compute()))["coefficient"]  # the noise of the model is what was there before the resets were known
+    noise = {axis: {str(term): float(rest.sel(axis=axis, term=term)) for term in rest["term"].values} for axis in quiet}
+    ratio = {}
+    for case, given in (("five terms", {"noise": model["noise"]}), ("with resets", {"noise": noise, "effect": resets})):
+        made = gyrostab.simulate(given, like=second, seed=1)
+        options = {"window": f"{second.sizes['time']}samples", "step": f"{second.sizes['time']}samples", "taus": TAUS}
+        both = [gyrostab.davar(log, **options)["avar"].isel(axis=0, time=0) for log in (second, made)]
+        ratio[case] = both[0].values / both[1].values
+    return both[0]["tau"].values, ratio
+
+
+if __name__ == "__main__":
+    os.chdir(os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings"))
+    for name in sys.argv[1:] or PLAN["recording"]:
+        print(row(name, gyrostab.diagnose(log_of(name))), flush=True)
+    for tau, *cases in zip(*(lambda taus, ratio: (taus, *ratio.values()))(*halves("fog-blueseis-ramp")), strict=True):
+        print(f"| {tau:g} | {' | '.join(f'{one:.2f}' for one in cases)} |")
