@@ -66,11 +66,11 @@ def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
 
     figure = new_figure(6.5, 1.2 + 0.26 * max(3, len(reliability)))
     panel: Any = figure.subplots()
-    for place, line in enumerate(reliability.itertuples(index=False)):
-        claim: Any = line
-        panel.barh(place, claim.right, color=COLOURS[2], height=0.6)
-        panel.plot([claim.low, claim.high], [place, place], color="black", linewidth=1.0)
-    panel.set_yticks(range(len(reliability)), [f"{line.name.replace('_', ' ')} ({line.n})" for line in reliability.itertuples(index=False)])
+    claims: list[Any] = reliability.to_dict("records")
+    for place, claim in enumerate(claims):
+        panel.barh(place, claim["right"], color=COLOURS[2], height=0.6)
+        panel.plot([claim["low"], claim["high"]], [place, place], color="black", linewidth=1.0)
+    panel.set_yticks(range(len(claims)), [f"{claim['name'].replace('_', ' ')} ({claim['n']})" for claim in claims])
     panel.invert_yaxis()
     panel.set_xlim(0, 1)
     panel.set_xlabel("share of the claims that are right, with 95 % interval")

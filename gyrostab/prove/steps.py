@@ -39,11 +39,10 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any]) -> str:
 def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bool:
     """Diagnose a recording, of which nothing but the file is known; whether that succeeded, else `failed` says why."""
     from gyrostab.diagnose.core import diagnose
-    from gyrostab.export import open_log
+    from gyrostab.run import load_log
 
     try:
-        with open_log(recording) as log:
-            found = diagnose(log, nulls=nulls, seed=int(recording.stem[:7], 16))
+        found = diagnose(load_log([recording]), nulls=nulls, seed=int(recording.stem[:7], 16))
         write_text(target, found.to_json())
     except Exception as error:  # a case that breaks the diagnosis is a result, and is shown as one
         lines = traceback.format_exc() if not isinstance(error, GyrostabError) else ""
@@ -58,16 +57,16 @@ def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[s
     import numpy as np
 
     from gyrostab.concealed import allan_detector, channel_detector
-    from gyrostab.export import open_log
+    from gyrostab.run import load_log
 
     if target.exists():
         kept: dict[str, bool] = json.loads(target.read_text(encoding="utf-8"))
         return kept
-    with open_log(recording) as log:
-        rng = np.random.default_rng(int(recording.stem[:7], 16))
-        said = {
-            "Allan plot": bool(allan_detector(np.asarray(log["rate"].values), truth, rng=rng)),
-            "correlation with channels": bool(channel_detector(log)),
-        }
+    log = load_log([recording]).compute()
+    rng = np.random.default_rng(int(recording.stem[:7], 16))
+    said = {
+        "Allan plot": bool(allan_detector(np.asarray(log["rate"].values), truth, rng=rng)),
+        "correlation with channels": bool(channel_detector(log)),
+    }
     write_json(target, said)
     return said

@@ -1,0 +1,45 @@
+"""Put the figures of a finished `gyrostab prove` on docs/proof.md.
+
+    python benchmarks/publish_proof.py proof
+
+Takes table.md between the marks of the page, and the curves to docs/figures. Refuses runs of a tuning seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+
+from page import renew
+
+from gyrostab.prove.folder import TUNING
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+FIGURES = ("completeness", "reliability")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and its figures")
+    options = parser.parse_args()
+    publish(options.run, options.docs)
+
+
+def publish(run: Path, docs: Path) -> None:
+    """Renew the page and the figures, or say why not."""
+    if not (run / "table.md").exists():
+        raise SystemExit(f"{run}: holds no finished run; gyrostab prove --resume -o {run} finishes it")
+    seed = json.loads((run / "benchmark.json").read_text(encoding="utf-8"))["seed"]
+    if seed < TUNING:
+        raise SystemExit(f"{run}: was made with seed {seed}; seeds below {TUNING} are for tuning, publish a run of another one")
+    pictures = [f"![{name} of the diagnosis](figures/proof-{name}.png)" for name in FIGURES]
+    for name in FIGURES:
+        shutil.copyfile(run / f"{name}.png", docs / "figures" / f"proof-{name}.png")
+    renew(docs / "proof.md", "proof", "\n\n".join([(run / "table.md").read_text(encoding="utf-8").strip(), *pictures]))
+
+
+if __name__ == "__main__":
+    main()
