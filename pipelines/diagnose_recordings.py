@@ -1,4 +1,4 @@
-"""Diagnose every recording of diagnose_recordings.toml, and print a table of what is named: python pipelines/diagnose_recordings.py [NAME ...]."""
+"""Diagnose the recordings of diagnose_recordings.toml, all or those named on the command line, and print a table of what is named."""
 
 import os
 import sys

@@ -177,7 +177,7 @@ def _matches(channel: str, unit: str, channels: tuple[str, ...], reduced: xr.Dat
 def _of_kind(kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray) -> tuple[list[Candidate], str]:
     """Candidates of one effect with its channels, by view; and why there are none."""
     if kind.channels and not drivers:
-        return [], f"the recording has no channel {' or '.join(kind.channels)}"
+        return _strangers(kind, reduced), f"the recording has no channel {' or '.join(kind.channels)}"
     windows = windows_of(reduced, drivers)
     predictions: list[tuple[dict[str, Any], Prediction]] = []
     why = ""
@@ -288,6 +288,15 @@ def _transfers(name: str, predictions: list[tuple[dict[str, Any], Prediction]], 
         for channel in [*found, *strange]:
             found[channel] = found.get(channel, []) + _any_transfer(windows.frequency.size)
     return [Candidate(name, "transfer", (), _distinct(variants), witness=(channel,)) for channel, variants in found.items()]
+
+
+def _strangers(kind: type[Effect], reduced: xr.Dataset) -> list[Candidate]:
+    """Real motion that only channels of no known effect see, a seismometer for instance."""
+    if kind.name != "real_motion" or "witness" not in reduced.dims:
+        return []
+    variants = _distinct(_any_transfer(reduced.sizes["band"]))
+    strange = sorted(str(one) for one in reduced["witness"].values if not _known(str(one)))
+    return [Candidate(kind.name, "transfer", (), variants, witness=(channel,)) for channel in strange]
 
 
 def _known(channel: str) -> bool:

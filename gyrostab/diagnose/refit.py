@@ -72,7 +72,7 @@ class Fitted:
 
     def say(self) -> str:
         """One sentence in plain words."""
-        if self.effect is None:
+        if self.effect is None or not self.parameters:
             return f"{effects()[self.claim.effect].short} (on {', '.join(self.axes)})."
         return self.effect.say({name: one.stderr for name, one in self.parameters.items()})
 
