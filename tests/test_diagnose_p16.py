@@ -46,7 +46,7 @@ def test_growing_coefficients_are_named_for_what_they_are(small) -> None:
     log, found = small
     fits = SCRIPT.published(log, PLAN | {"parts": {"still": [5, 80], "shaken": [90, 160]}})
     for term in ("N", "K"):  # as the paper reports, though both are what they are at rest
-        assert (fits["shaken"][term] > 2.0 * fits["still"][term]).all()
+        assert (fits["shaken"][term] > 1.5 * fits["still"][term]).all()
     named = {name for effect in found.effects for name in (effect["name"], *effect["alternatives"])}
     assert {"aliased_vibration", "vibration_rectification"} <= named
     assert named <= {"aliased_vibration", "vibration_noise", "vibration_rectification", "g_sensitivity"}
@@ -160,3 +160,12 @@ def test_what_the_axes_share_by_the_model_is_no_mismatch(loud) -> None:
     before, after = (np.nanmax(np.abs(cross_axis.score(shared, one)["z"].values)) for one in (base, model))
     assert before > 30.0
     assert after < 8.0
+
+
+def test_odd_samples_count_on_held_out_time() -> None:
+    model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003}, "effect": [{"name": "spikes", "axes": ["x"], "per_hour": 300.0}]}
+    found = gyrostab.diagnose(gyrostab.simulate(model, duration="10min", rate=20.0, seed=2).compute(), nulls=100)
+    (effect,) = found.effects
+    assert effect["name"] == "spikes"
+    held = found.content["held_out"]
+    assert held["log_likelihood_gain"] > 0.5 * effect["held_out_gain"]["nats"] > 20.0

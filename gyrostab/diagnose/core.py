@@ -209,7 +209,8 @@ def _concluded(
     """Fit what was named, see what it is worth and what is left, and put it all into one result."""
     fitted = fit_claims(naming, baseline)
     after = predicted(naming, baseline) if naming.claims else baseline
-    held = held_out(reduced, baseline, (lambda known: predicted(naming, baseline, known)) if naming.claims else baseline)
+    odd = sum(part.gain for claim in naming.claims for part in claim.parts if part.candidate.view == "marks")  # no other number has them
+    held = held_out(reduced, baseline, (lambda known: predicted(naming, baseline, known)) if naming.claims else baseline, more_gain=odd)
     mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level / 2.0))
     mismatches += claim_tables(naming, reduced, mismatches)
     mismatches += unknown_tables(naming, reduced, mismatches)

@@ -136,7 +136,9 @@ def _effect(effect: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, 
         "gain": f"{_number(gain['nats'])} ± {_number(gain['stderr'], 2)} nats (chance reaches {_number(gain['threshold'], 2)})",
         "alternatives": [f"{plain_name(name)} ({name})" for name in effect["alternatives"]],
         "next": next_measurement(effect["name"], effect["alternatives"]),
-        "boxes": [box["id"] for box in content["mismatches"] if effect["name"] in box["explained_by"]],
+        "boxes": [
+            box["id"] for box in content["mismatches"] if effect["name"] in box["explained_by"] and set(effect["axes"]) & set(box["axes"])
+        ],
     }
 
 
