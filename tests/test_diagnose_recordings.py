@@ -46,7 +46,7 @@ def test_resets_of_the_ramp_come_before_their_lines(log_of: Callable[..., Any]) 
     model = next(one for one in found.model["effect"] if one["name"] == "feedback_reset")
     assert model["phase"] == "channel"
     assert model["full"] < 0  # the ramp falls while the rate is positive
-    lines = [box for box in found.content["mismatches"] if "line at 4.2" in box["statement"]]
+    lines = [box for box in found.content["mismatches"] if "line at 4 Hz" in box["statement"]]
     assert lines
     assert all("feedback_reset" in box["explained_by"] for box in lines)
     assert "spectral_line" not in lines[0]["explained_by"]
