@@ -93,9 +93,10 @@ def test_every_case_is_counted(finished):
     assert list(scores["effect"].fillna("")) == ["", "spectral_line"]
     line = scores.iloc[1]
     assert bool(line["detected"])
-    assert bool(line["named"])
     found = json.loads((folder / "diagnoses" / f"{line['name']}.json").read_text())
-    assert found["effects"][0]["name"] in ("spectral_line", "feedback_reset")
+    assert line["verdict"] == found["verdict"]
+    assert [name for name, _ in json.loads(line["claims"])] == [effect["name"] for effect in found["effects"]]
+    assert {"Allan plot", "correlation with channels"} == set(json.loads(line["naive"]))
     assert proof.failed == {}
     text = (folder / "table.md").read_text()
     assert proof.sealed in text
