@@ -294,8 +294,8 @@ def _order(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
     for each in candidates:
         for variant in each.variants:
             for pattern in (variant.design[0], np.conj(variant.design[0])):
-                columns = [order_columns(one, (0,)) for one in pattern]
-                designs.append(_spread([np.concatenate(parts) for parts in zip(*columns, strict=True)], both.shape))
+                by_axis = [order_columns(one, (0,)) for one in pattern]
+                designs.append(_spread([np.concatenate(parts) for parts in zip(*by_axis, strict=True)], both.shape))
     named = [state.given.get(("order", axis), []) for axis in state.axes]
     given, precision = np.empty((*both.shape, 0)), np.empty((0, 0))
     for number, columns in enumerate(named):

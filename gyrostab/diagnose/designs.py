@@ -100,7 +100,7 @@ def term_density(symbol: str, frequency: Array, rate: float) -> Array:
 
 def _choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
     """Each parameter by itself, and all together."""
-    alone = [(name,) for name in columns]
+    alone: list[tuple[str, ...]] = [(name,) for name in columns]
     return alone if len(alone) < 2 else [*alone, tuple(columns)]
 
 

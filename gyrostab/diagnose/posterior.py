@@ -121,7 +121,7 @@ def _by_powers(fit: Fit, square: Array, K: Array, B: Array) -> tuple[Array, Arra
     right = (weight * (fit.power - slow)) @ near
     best = np.linalg.solve(normal, right.T).T
     alone = np.maximum(right[:, 1] / normal[1, 1], 1e-6 * square[1])
-    inside = np.asarray(best > 0.0).all(axis=1)
+    inside = np.asarray((best > 0.0).all(axis=1))
     used = np.where(inside[:, None], best, np.stack([np.zeros_like(alone), alone], axis=1))
     spectrum = used @ near.T + slow
     return np.asarray(-(fit.weight * (np.log(spectrum) + fit.power / spectrum)).sum(axis=1)), np.asarray(best), np.asarray(normal)
@@ -176,7 +176,7 @@ def noise_posterior(
     covariance = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
     error = np.sqrt(np.diag(covariance))
     if joined:
-        spread = np.linalg.inv(normal)
+        spread = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         together = np.concatenate([_draw_near(best[cell], spread, rng), slow_draws], axis=1)
     else:
         together = np.maximum(square + error * rng.standard_normal((draws, 4)), 0.0)

@@ -176,7 +176,7 @@ def _cells(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
 
 def _marks(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray, tallies: Tallies) -> list[Found]:
     subsets = fold_subsets(folds)
-    rows = [(axis,) for axis in state.axes]
+    rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     coarse = coarse_lattice(state.reduced)
     out = []
     for each in group:
@@ -223,6 +223,6 @@ def _lines(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[F
     place = np.maximum(gain, 0.0).sum(axis=1).argmax(axis=-1)  # (record,), one line for all axes
     best = np.take_along_axis(gain, place[:, None, None], axis=2)[..., 0]
     best = np.where(np.isfinite(best), best, -np.log(power.shape[-1]))
-    rows = [(axis,) for axis in state.axes]
+    rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     places = np.repeat(place[:, None], len(rows), axis=1)
     return [Found(each, rows, best, tuple(each.variants[0] for _ in rows), places) for each in group]

@@ -97,7 +97,7 @@ def _log_ratio(count: Array, mean: Array) -> Array:
     a, b = _SHAPE, _RATE
     raised = gammaln(count + a) - gammaln(a) + a * np.log(b) - (count + a) * np.log(b + mean) + count * np.log(mean)
     even = -mean + count * np.log(mean)
-    return np.where(count > mean, raised - even, np.minimum(raised - even, 0.0))
+    return np.asarray(np.where(count > mean, raised - even, np.minimum(raised - even, 0.0)))
 
 
 def _held_out(evidence: Array, lengths: int) -> Array:
@@ -166,7 +166,7 @@ def line_gains(power: Array, weight: Array) -> Array:
         train = np.maximum(share[:, ~held].sum(axis=1), 1e-9)
         excess = np.maximum((ratio[:, :, ~held] * share[:, ~held]).sum(axis=2) / train - 1.0, 0.0)[:, :, None]
         gain += (share[:, held] * (ratio[:, :, held] * excess / (1.0 + excess) - np.log1p(excess))).sum(axis=2)
-    return gain - np.log(power.shape[3])
+    return np.asarray(gain - np.log(power.shape[3]))
 
 
 def local_level(total: Array) -> Array:
