@@ -347,7 +347,10 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     parts = _pools(stamps)
     period = SECOND / rate
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64) if parts else np.empty(0)
-    if len(steps) == 0 or np.mean(np.abs(steps / period - 1) < 0.25) < _SINGLE or _misfit(steps, period) > 0.15:
+    single = steps[np.abs(steps / period - 1) < 0.25]
+    if len(single) == 0 or len(single) < _SINGLE * len(steps) or _misfit(steps, period) > 0.15:
+        return None
+    if abs(np.median(single) / period - 1) > 0.02:  # another rate, not this one with rows missing
         return None
     return _estimate(_pieces(stamps, period, False, False, _sure(len(steps)) * period), period, False, False)
 
