@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from gyrostab.diagnose.explained import explain_away
 from gyrostab.diagnose.folds import FOLDS, fold_blocks, fold_subsets
@@ -15,6 +16,13 @@ from gyrostab.diagnose.surrogates import beats_slides
 from gyrostab.diagnose.tallies import count_gains, expected_counts, line_gains
 from gyrostab.errors import OptionError
 from tests.named import WORLD, nulls, record
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """As `gyrostab.diagnose` has it: threads of the linear algebra would only wait for each other."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 def named(effects, *, environment=WORLD["usual"], seed=1, drop=(), count=40):

@@ -81,7 +81,7 @@ def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau
     --------
     >>> check_windows(window="10", step="1min")
     Traceback (most recent call last):
-    gyrostab.errors.OptionError: window '10' has no unit; write for instance 10s, 10min or 10samples
+    gyrostab.errors.OptionError: window '10' has no unit; write for instance 10min, 30s or 2000samples
     """
     from gyrostab.windows import averaging_factors, duration_seconds, samples
 
