@@ -8,9 +8,9 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline import calibrate
 from gyrostab.diagnose.candidates import VIEWS, effect_candidates, term_density, windows_of
-from gyrostab.diagnose.cells import begin_state, cell_factors, cells_of, drawn, effective
+from gyrostab.diagnose.cells import begin_state, cells_of, drawn, effective, power_column
 from gyrostab.diagnose.folds import fold_blocks
-from gyrostab.diagnose.gain import power_factors
+from gyrostab.diagnose.gain import cell_factors, power_factors
 from gyrostab.diagnose.generics import generic_candidates, splines
 from gyrostab.diagnose.reduced import reduce_log
 from gyrostab.physics.registry import effects
@@ -137,14 +137,17 @@ def test_splines_add_to_one():
 # ----------------------------------------------------------------------------------------------------------------- cells
 
 
-def test_cells_of_powers_are_scored_as_powers(plain):
+@pytest.mark.parametrize("common", [0.0, 0.05])
+def test_cells_of_powers_are_scored_as_powers(plain, common):
     baseline = calibrate(plain)
+    baseline = baseline.assign(common=baseline["common"] + common)
     folds = fold_blocks(plain)
     generic = [one for one in generic_candidates(plain) if one.effect == "~N(t)"]
-    cells = cells_of(generic, 0, plain, begin_state(plain, baseline))
-    mine = cell_factors(cells, folds)
-    spectrum = baseline["spectrum"].values[0]
-    theirs = power_factors(plain, baseline, [cells.designs[0] / spectrum[..., None]], axis="x", folds=folds)[:, 1:]
+    state = begin_state(plain, baseline)
+    cells = cells_of(generic, 0, plain, state)
+    mine = cell_factors(cells, folds)[:, 1:]
+    designs = [power_column(one, 0, state) / baseline["spectrum"].values[0] for one in generic[0].variants[0].design]
+    theirs = power_factors(plain, baseline, [np.stack(designs, axis=-1)], axis="x", folds=folds)[:, 1:]
     np.testing.assert_allclose(mine, theirs, atol=1e-6)
 
 

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.candidates import Candidate
-from gyrostab.diagnose.folds import FOLDS
-from gyrostab.diagnose.gain import noise_columns
-from gyrostab.diagnose.products import WIDTHS, Products, evidence, limits_of, power_products, take_out
+from gyrostab.diagnose.gain import Cells, independent, noise_columns
 
-__all__ = ["Cells", "State", "begin_state", "cell_factors", "cells_of", "drawn", "effective", "pair_rows", "view_rows"]
+__all__ = ["State", "begin_state", "cells_of", "drawn", "effective", "pair_rows", "view_rows"]
 
 Array = NDArray[Any]
 
@@ -61,83 +59,10 @@ class State:
         return [str(one) for one in self.reduced["axis"].values]
 
 
-class Cells(NamedTuple):
-    """One row of a view as a linear model.
-
-    Attributes
-    ----------
-    values : ndarray, shape (block, cell, record)
-    weight : ndarray, shape (block, cell)
-        One over the variance; 0 where there are no data.
-    designs : list of ndarray, shape (block, cell, column)
-    given : ndarray, shape (block, cell, column)
-    precision : ndarray, shape (column, column)
-        Of the given columns; negative on the diagonal where it is to be taken from the data (nearly free).
-    """
-
-    values: Array
-    weight: Array
-    designs: list[Array]
-    given: Array
-    precision: Array
-
-
 def begin_state(reduced: xr.Dataset, baseline: xr.Dataset) -> State:
     """Nothing is named yet."""
     weight = baseline["spectrum"].transpose("axis", "block", "band").values
     return State(reduced, baseline, weight, np.zeros(weight.shape[:2], np.bool_))
-
-
-def cell_factors(cells: Cells, folds: xr.DataArray) -> Array:
-    """Logarithms of Bayes factors of designs, on the subsets of `fold_subsets`, as `gyrostab.diagnose.gain.power_factors` has them.
-
-    Returns
-    -------
-    ndarray, shape (subset, design, record)
-    """
-    _, width, records = cells.values.shape
-    weight = np.where(np.isfinite(cells.weight) & np.isfinite(cells.values).all(axis=2), cells.weight, 0.0)
-    values = np.where(weight[..., None] > 0.0, cells.values, 0.0)
-    count = cells.given.shape[2]
-    flat = [np.where(np.isfinite(one), one, 0.0) for one in cells.designs]
-    columns = np.concatenate([*flat, np.where(np.isfinite(cells.given), cells.given, 0.0)], axis=2)
-    ends = np.cumsum([one.shape[2] for one in flat])
-    numbers = [np.arange(end - one.shape[2], end) for one, end in zip(flat, ends, strict=True)]
-    classes, member = np.unique(folds.transpose("block", "length").values, axis=0, return_inverse=True)
-    parts = []
-    for number in range(len(classes)):
-        chosen = member.ravel() == number
-        size = int(chosen.sum()) * width
-        parts.append(power_products(values[chosen].reshape(size, records), weight[chosen].ravel(), columns[chosen].reshape(size, -1)))
-    total = _summed(parts)
-    own = columns.shape[2] - count
-    before = np.diagonal(total.gram[0])
-    precision = _nearly_free(cells.precision, before[own:])
-    limits = limits_of(before[:own], np.diagonal(take_out(total, count, precision).gram[0]))
-    found = [total]
-    for length in range(classes.shape[1]):
-        for number in range(FOLDS):
-            held = _summed([part for part, label in zip(parts, classes[:, length], strict=True) if label == number], total)
-            found.append(Products(*[a - b for a, b in zip(_fields(total), _fields(held), strict=True)]))
-    out = np.stack([evidence(take_out(part, count, precision), numbers, limits, np.zeros(1)) for part in found])
-    return np.asarray(out[:, 1:] - out[:, :1])
-
-
-def _fields(products: Products) -> tuple[Array, ...]:
-    return products.square, products.cross, products.gram, products.log_determinant
-
-
-def _summed(parts: Sequence[Products], like: Products | None = None) -> Products:
-    if not parts and like is not None:
-        return Products(*[np.zeros_like(one) for one in _fields(like)])
-    return Products(*[np.sum(several, axis=0) for several in zip(*map(_fields, parts), strict=True)])
-
-
-def _nearly_free(precision: Array, square: Array) -> Array:
-    """Precisions of given columns, those that are negative from the widest prior of a design."""
-    known = np.diagonal(precision)
-    free = np.where(square > 0.0, square, 1.0) / WIDTHS[-1] ** 2
-    return np.diag(np.where(known < 0.0, free, known))
 
 
 def drawn(cells: Cells, rng: np.random.Generator, count: int) -> Cells:
@@ -220,7 +145,7 @@ def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
     axis = state.axes[row]
     expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
     values = _records(data["power"].transpose(..., "axis", "block", "band").values, 3)[row] - expected[..., None]
-    weight = state.reduced["shape"].values[row] / state.weight[row] ** 2
+    weight = state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values / state.weight[row] ** 2
     weight = np.where(state.masked[row][:, None], 0.0, weight)
     level, precision = noise_columns(state.baseline, axis=axis)
     known = [level[..., number] * expected for number in range(level.shape[2])]
@@ -228,7 +153,7 @@ def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
     designs = [
         _spread([power_column(one, row, state) for one in variant.design], weight.shape) for each in candidates for variant in each.variants
     ]
-    return Cells(values, weight, designs, given, whole)
+    return independent(Cells(values, weight, designs, given, whole), state.baseline["common"].sel(axis=axis).values, state.weight[row])
 
 
 # --------------------------------------------------------------------------------------------------------------- crosses

@@ -13,7 +13,7 @@ the sum over the folds of what its factor loses when the fold is taken out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -34,7 +34,18 @@ from gyrostab.diagnose.products import (
 )
 from gyrostab.errors import OptionError
 
-__all__ = ["Tier", "mean_factors", "mean_gains", "noise_columns", "power_factors", "power_gains", "score"]
+__all__ = [
+    "Cells",
+    "Tier",
+    "cell_factors",
+    "independent",
+    "mean_factors",
+    "mean_gains",
+    "noise_columns",
+    "power_factors",
+    "power_gains",
+    "score",
+]
 
 #: "free": any noise may be there (to name an effect); "calibrated": the noise is the calibrated one (to detect that something is there).
 Tier = Literal["free", "calibrated"]
@@ -151,29 +162,96 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
     return columns, np.diag(1.0 / np.square(error))
 
 
-def _partition(folds: xr.DataArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Class of every block by its folds at all lengths, and the folds of every class, shape (class, length)."""
-    fold = folds.transpose("block", "length").values
-    rows, member = np.unique(fold, axis=0, return_inverse=True)
-    return np.asarray(member.ravel(), dtype=np.int64), np.asarray(rows, dtype=np.int64)
+class Cells(NamedTuple):
+    """Data that are independent from cell to cell, as a linear model.
+
+    Attributes
+    ----------
+    values : ndarray, shape (block, cell, record)
+    weight : ndarray, shape (block, cell)
+        One over the variance; 0 where there are no data.
+    designs : list of ndarray, shape (block, cell, column)
+    given : ndarray, shape (block, cell, column)
+        Columns that are in the model with and without a design.
+    precision : ndarray, shape (column, column)
+        Of the given columns; negative on the diagonal where it is to be taken from the data (nearly free).
+    """
+
+    values: Array
+    weight: Array
+    designs: list[Array]
+    given: Array
+    precision: Array
 
 
-def _subset_products(parts: list[Products], classes: NDArray[np.int64]) -> list[Products]:
-    """Products on the subsets of `fold_subsets` from those on the classes of `_partition`."""
+def independent(cells: Cells, common: Array, unit: Array | None = None) -> Cells:
+    """The same model with independent cells, where those of a block rise and fall together; see `share_out`."""
+    weight = np.where(np.isfinite(cells.weight) & np.isfinite(cells.values).all(axis=2), cells.weight, 0.0)
+    seen = weight[..., None] > 0.0
+    values, given, *designs = (
+        share_out(np.where(seen & np.isfinite(one), one, 0.0), weight, common, unit) for one in (cells.values, cells.given, *cells.designs)
+    )
+    return Cells(values, weight, designs, given, cells.precision)
 
-    def total(chosen: NDArray[np.bool_]) -> Products:
-        sums = [np.asarray(sum(getattr(part, name) for part, use in zip(parts, chosen, strict=True) if use)) for name in names]
-        return Products(*sums)
 
-    names = ("square", "cross", "gram", "log_determinant")
-    everything = np.ones(len(classes), np.bool_)
-    held = [classes[:, length] == number for length in range(classes.shape[1]) for number in range(FOLDS)]
-    full = total(everything)
-    out = [full]
-    for chosen in held:
-        taken = total(chosen) if chosen.any() else None
-        out.append(full if taken is None else Products(*[getattr(full, name) - getattr(taken, name) for name in names]))
+def cell_factors(cells: Cells, folds: xr.DataArray) -> Array:
+    """Factors of designs in independent cells.
+
+    Parameters
+    ----------
+    cells : Cells
+    folds : xarray.DataArray
+        From `fold_blocks`.
+
+    Returns
+    -------
+    ndarray, shape (subset, 1 + design, record)
+        As in `mean_factors`.
+    """
+    _, width, records = cells.values.shape
+    weight = np.where(np.isfinite(cells.weight) & np.isfinite(cells.values).all(axis=2), cells.weight, 0.0)
+    values = np.where(weight[..., None] > 0.0, cells.values, 0.0)
+    count = cells.given.shape[2]
+    flat = [np.where(np.isfinite(one), one, 0.0) for one in (*cells.designs, cells.given)]
+    columns = np.concatenate(flat, axis=2)
+    ends = np.cumsum([one.shape[2] for one in cells.designs])
+    numbers = [np.arange(end - one.shape[2], end) for one, end in zip(cells.designs, ends, strict=True)]
+    classes, member = np.unique(folds.transpose("block", "length").values, axis=0, return_inverse=True)
+    parts = []
+    for number in range(len(classes)):
+        chosen = member.ravel() == number
+        size = int(chosen.sum()) * width
+        parts.append(power_products(values[chosen].reshape(size, records), weight[chosen].ravel(), columns[chosen].reshape(size, -1)))
+    total = _summed(parts)
+    own = columns.shape[2] - count
+    before = np.asarray(np.diagonal(total.gram[0]))
+    precision = _nearly_free(cells.precision, before[own:])
+    limits = limits_of(before[:own], np.asarray(np.diagonal(take_out(total, count, precision).gram[0])))
+    found = [total]
+    for length in range(classes.shape[1]):
+        for number in range(FOLDS):
+            held = _summed([part for part, label in zip(parts, classes[:, length], strict=True) if label == number], total)
+            found.append(Products(*[a - b for a, b in zip(_fields(total), _fields(held), strict=True)]))
+    out = np.stack([evidence(take_out(part, count, precision), numbers, limits, np.zeros(1)) for part in found])
+    out[:, 1:] -= out[:, :1]
     return out
+
+
+def _fields(products: Products) -> tuple[Array, ...]:
+    return products.square, products.cross, products.gram, products.log_determinant
+
+
+def _summed(parts: Sequence[Products], like: Products | None = None) -> Products:
+    if not parts and like is not None:
+        return Products(*[np.zeros_like(one) for one in _fields(like)])
+    return Products(*[np.sum(several, axis=0) for several in zip(*map(_fields, parts), strict=True)])
+
+
+def _nearly_free(precision: Array, square: Array) -> Array:
+    """Precisions of given columns, those that are negative from the widest prior of a design."""
+    known = np.diagonal(precision)
+    free = np.where(square > 0.0, square, 1.0) / WIDTHS[-1] ** 2
+    return np.diag(np.where(known < 0.0, free, known))
 
 
 def power_factors(
@@ -205,35 +283,15 @@ def power_factors(
         As in `mean_factors`.
     """
     shape = (data.sizes["block"], data.sizes["band"])
-    residual = _records((data["power"] / baseline["spectrum"] - 1.0).sel(axis=axis), "block", "band")
-    common = baseline["common"].sel(axis=axis).values
-    weight = np.array(baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64)
-    weight[~np.isfinite(residual).all(axis=2) | ~np.isfinite(weight)] = 0.0
-    residual[weight == 0.0] = 0.0
-    columns, numbers = _columns(designs, shape)
+    values = _records((data["power"] / baseline["spectrum"] - 1.0).sel(axis=axis), "block", "band")
+    weight = np.asarray(baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64)
     level, precision = noise_columns(baseline, axis=axis, tier=tier)
-    beside, _ = _columns([level] if given is None else [level, np.asarray(given).reshape(*shape, -1)], shape)
-    count = beside.shape[1]
-    columns = np.concatenate([columns, beside], axis=1)
-    residual = share_out(residual, weight, common)
-    columns = share_out(columns.reshape(*shape, -1), weight, common).reshape(columns.shape)
-    member, classes = _partition(fold_blocks(data) if folds is None else folds)
-    parts = []
-    for number in range(len(classes)):
-        chosen = member == number
-        cells = np.repeat(chosen, shape[1])
-        parts.append(power_products(residual[chosen].reshape(int(cells.sum()), -1), weight[chosen].ravel(), columns[cells]))
-    products = _subset_products(parts, classes)
-    terms, own = len(precision), sum(one.size for one in numbers)
-    before = np.asarray(np.diagonal(products[0].gram[0]))
-    extra = limits_of(before, before)[own + terms :]
-    full = np.zeros((count, count))
-    full[:terms, :terms] = precision
-    full[terms:, terms:] = np.diag(1.0 / np.square(np.where(extra > 0.0, extra, 1.0) * WIDTHS[-1]))
-    limits = limits_of(before[:own], np.asarray(np.diagonal(take_out(products[0], count, full).gram[0])))
-    out = np.stack([evidence(take_out(part, count, full), numbers, limits, np.zeros(1)) for part in products])
-    out[:, 1:] -= out[:, :1]
-    return out
+    beside = np.empty((*shape, 0)) if given is None else np.asarray(given, dtype=np.float64).reshape(*shape, -1)
+    wide = np.diag([*np.diagonal(precision), *[-1.0] * beside.shape[2]])
+    columns, numbers = _columns(designs, shape)
+    each = [columns[:, chosen].reshape(*shape, -1) for chosen in numbers]
+    cells = Cells(values, weight, each, np.concatenate([level, beside], axis=2), wide)
+    return cell_factors(independent(cells, baseline["common"].sel(axis=axis).values), fold_blocks(data) if folds is None else folds)
 
 
 def _gains(factors: Array, candidates: Mapping[str, Sequence[Array]]) -> xr.DataArray:

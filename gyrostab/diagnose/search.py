@@ -10,9 +10,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.candidates import Candidate, Variant
-from gyrostab.diagnose.cells import State, cell_factors, cells_of, drawn, view_rows
+from gyrostab.diagnose.cells import State, cells_of, drawn, view_rows
 from gyrostab.diagnose.folds import fold_subsets
-from gyrostab.diagnose.gain import mean_factors, score
+from gyrostab.diagnose.gain import cell_factors, mean_factors, score
 from gyrostab.diagnose.tallies import (
     OF_LATTICE,
     Expected,
@@ -169,7 +169,7 @@ def _cells(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
         cells = cells_of(group, row, data if there else state.reduced, state)
         if not there and rng is not None:
             cells = drawn(cells, rng, data.sizes["record"])
-        factors.append(cell_factors(cells, folds))
+        factors.append(cell_factors(cells, folds)[:, 1:])
         spread = factors[-1].shape[1] // sum(len(each.variants) for each in group)
     return _collect(group, rows, factors, spread)
 
