@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -89,6 +89,29 @@ def avar(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:
     """Allan variance of every row over the whole record."""
     log = make_log(np.atleast_2d(rates), rate=rate, unit="deg/h")
     return davar(log, window=log.sizes["time"], taus=[float(tau) for tau in taus], tau_max=float(max(taus))).avar.isel(time=0).values
+
+
+def sigma(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:
+    """Allan deviation of every row over the whole record."""
+    return np.sqrt(avar(rates, rate, taus))
+
+
+def allan_of_density(density: Callable[[NDArray[np.float64]], Any], tau: float, top: float) -> float:
+    """Allan variance of a two-sided density (P16 Eq. 7), by numerical integration up to `top` [Hz]."""
+    f = np.linspace(top / 400_000, top, 400_000)
+    return float(4.0 * np.trapezoid(density(f) * np.sin(np.pi * f * tau) ** 4 / (np.pi * f * tau) ** 2, f))
+
+
+def allan_of_samples(density: Callable[[NDArray[np.float64]], Any], k: int, rate: float) -> float:
+    """Allan variance of samples with a two-sided density, k samples at a time: the mean of k has the response of Dirichlet."""
+    f = (np.arange(200_000) + 0.5) * (rate / 2) / 200_000
+    x = np.pi * f / rate
+    return float(4.0 * np.sum(density(f) * np.sin(k * x) ** 4 / (k * np.sin(x)) ** 2) * (f[1] - f[0]))
+
+
+def steady(channel: str, unit: str, value: float) -> dict[str, Any]:
+    """Environment of a model: a channel that never changes."""
+    return {"profile": "steps", "channel": channel, "unit": unit, "points": [[0, value]]}
 
 
 def windows_of(size: int, rate: float, length: float, frequency: Any = (1.0,), **more: Any) -> Windows:
