@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,6 +27,14 @@ def write_log(
 
 def call(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
+
+
+def stopped(code: str, *, exit_code: int, says: str) -> None:
+    """Run `code` in a process of its own: it ends with this exit code and these words, and without a traceback."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == exit_code, done.stderr
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 WINDOW = ("--window", "20s", "--step", "5s")

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.null_scores import NullScores, standardise
+from gyrostab.diagnose.views import VIEWS
 from gyrostab.noise import TERMS
 
 RATE, BLOCK_S, PARTS = 100.0, 20.0, 8
@@ -97,6 +99,17 @@ def chunks(base: xr.Dataset, count: int, rng: np.random.Generator, *, size: int 
     """Null records, `size` at a time."""
     for _ in range(count // size):
         yield records(base, size, rng, **options)
+
+
+def smallest_p(reduced: xr.Dataset, base: xr.Dataset, null: NullScores) -> np.ndarray:
+    """The chance that a null record has a score as large as the largest of a record over all views; one for each record."""
+    p = []
+    for name, view in null.views.items():
+        scores = VIEWS[name](reduced, base)
+        if scores is not None:
+            z = np.abs(np.nan_to_num(standardise(scores, view))).max(axis=(-3, -2, -1))
+            p.append(null.p_value(name, z))
+    return np.asarray(np.min(p, axis=0))
 
 
 def _cross(first: np.ndarray, second: np.ndarray, shape: np.ndarray, rng: np.random.Generator) -> np.ndarray:

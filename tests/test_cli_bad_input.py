@@ -17,7 +17,7 @@ from gyrostab.errors import OutputError
 from gyrostab.export import open_log, open_product, to_netcdf
 from gyrostab.read.buffers import Buffers
 from gyrostab.run import load_log
-from tests.command_line import RATE, WINDOW, call, write_log
+from tests.command_line import RATE, WINDOW, call, stopped, write_log
 
 
 @pytest.fixture(scope="module")
@@ -153,10 +153,7 @@ def test_disk_full_while_writing(tmp_path):
         "resource.setrlimit(resource.RLIMIT_FSIZE, (2**19, 2**19)); "
         f"sys.exit(main(['ingest', {str(path)!r}, '-o', {str(tmp_path / 'log.nc')!r}, '--quiet-progress']))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2, done.stderr
-    assert "log.nc" in done.stderr
-    assert "Traceback" not in done.stderr
+    stopped(code, exit_code=2, says="log.nc")
     assert [entry.name for entry in tmp_path.iterdir()] == ["tool.csv"]
 
 

@@ -9,11 +9,11 @@ from scipy import stats
 
 from gyrostab.diagnose.boxes import merged
 from gyrostab.diagnose.locate import locate
-from gyrostab.diagnose.null_scores import null_scores, smallest_p
+from gyrostab.diagnose.null_scores import null_scores
 from gyrostab.diagnose.reduced import reduce_log
 from gyrostab.errors import OptionError
 from gyrostab.log import make_log
-from tests.reduced_records import BLOCK_S, RATE, baseline, chunks, records
+from tests.reduced_records import BLOCK_S, RATE, baseline, chunks, records, smallest_p
 
 SIGMA = 1.8  # of a sample [deg/h]: 0.003 deg/sqrt(h) at 100 Hz
 SIZE = 360_000

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.views import VIEWS
 from gyrostab.errors import OptionError
 
-__all__ = ["NullScores", "Tail", "ViewNull", "null_scores", "smallest_p", "standardise"]
+__all__ = ["NullScores", "Tail", "ViewNull", "null_scores", "standardise"]
 
 Array = NDArray[np.float64]
 _BELOW = 1.4  # standard deviations below the largest of independent cells, from which on scores are kept
@@ -126,30 +126,6 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
         views[name] = ViewNull(mean, spread, _tail(half))
         largest[name] = views[name].tail.surprise(half)
     return NullScores(views, _tail(np.max(list(largest.values()), axis=0)), records)
-
-
-def smallest_p(reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores) -> Array:
-    """P-value of the largest score of a record over all views: the chance that a null record has one as large.
-
-    Parameters
-    ----------
-    reduced, baseline : xarray.Dataset
-        A recording, or several by ``record``, and what the simulation expects.
-    null : NullScores
-        From `null_scores`.
-
-    Returns
-    -------
-    ndarray
-        One for each record; of no dimension for a recording.
-    """
-    p = []
-    for name, view in null.views.items():
-        scores = VIEWS[name](reduced, baseline)
-        if scores is not None:
-            z = np.abs(np.nan_to_num(standardise(scores, view))).max(axis=(-3, -2, -1))
-            p.append(null.p_value(name, z))
-    return np.asarray(np.min(p, axis=0))
 
 
 def standardise(scores: xr.Dataset, null: ViewNull) -> Array:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata, resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from gyrostab.diagnose.sentences import axes_text, chance, length_text, next_mea
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
 from gyrostab.plot.style import embedded
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["write_diagnosis_report"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -38,22 +38,7 @@ def run(
     output
         NetCDF file to write.
     """
-    from gyrostab.run import run as run_job
-
-    with work(common) as stage:
-        target = run_job(
-            logs,
-            output,
-            reading=reading.options(),
-            windows=windows.options(),
-            fitting=fitting.options(),
-            overwrite=common.overwrite,
-            resume=running.resume,
-            scheduler=running.scheduler,
-            workers=common.workers,
-            stage=stage,
-        )
-    print(target)
+    print(_job(logs, output, windows, reading, running, common, fitting=fitting.options()))
 
 
 @app.command(sort_key=4, help_epilogue="")
@@ -78,22 +63,7 @@ def davar(
     output
         NetCDF file to write.
     """
-    from gyrostab.run import run as run_job
-
-    with work(common) as stage:
-        target = run_job(
-            logs,
-            output,
-            reading=reading.options(),
-            windows=windows.options(),
-            surface_only=True,
-            overwrite=common.overwrite,
-            resume=running.resume,
-            scheduler=running.scheduler,
-            workers=common.workers,
-            stage=stage,
-        )
-    print(target)
+    print(_job(logs, output, windows, reading, running, common, surface_only=True))
 
 
 @app.command(sort_key=5, help_epilogue="")
@@ -125,3 +95,22 @@ def fit(
         stage("fitting", 0)
         to_netcdf(fit_noise(open_surface(surface), **fitting.options()), target, overwrite=common.overwrite)
     print(target)
+
+
+def _job(logs: list[Path], output: Path, windows: Windows, reading: Reading, running: Running, common: Common, **more: Any) -> Path:
+    """Run the main job with what all its commands let the user choose."""
+    from gyrostab.run import run as run_job
+
+    with work(common) as stage:
+        return run_job(
+            logs,
+            output,
+            reading=reading.options(),
+            windows=windows.options(),
+            overwrite=common.overwrite,
+            resume=running.resume,
+            scheduler=running.scheduler,
+            workers=common.workers,
+            stage=stage,
+            **more,
+        )

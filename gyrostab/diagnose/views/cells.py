@@ -110,11 +110,11 @@ def view_dataset(
     name: str,
     reduced: xr.Dataset,
     *,
-    rows: Sequence[str],
     windows: Windows,
     columns: dict[str, Any],
     z: Array,
     ratio: Array,
+    rows: Sequence[str] | None = None,
     estimate: Array | None = None,
     units: str = "1",
     one_sided: bool = False,
@@ -127,8 +127,6 @@ def view_dataset(
         View, one of the contract's.
     reduced : xarray.Dataset
         Of `gyrostab.diagnose.reduced.reduce_log`; gives the edges of the windows.
-    rows : sequence of str
-        Axes of each row, those of one row parted by a blank.
     windows : Windows
         The windows.
     columns : dict
@@ -136,6 +134,8 @@ def view_dataset(
         deviation that null records may give to a score.
     z, ratio : ndarray (..., row, window, tau)
         Near-normal score; observed over expected.
+    rows : sequence of str, optional
+        Axes of each row, those of one row parted by a blank; by default a row is an axis of the record.
     estimate : ndarray, optional
         The mismatch as a number of `units`.
     units : str
@@ -158,7 +158,7 @@ def view_dataset(
             "ratio": (dims, ratio, {"units": "1", "long_name": "observed over expected"}),
         },
         coords={
-            "axes": ("row", np.asarray(rows, dtype=str)),
+            "axes": ("row", np.asarray(reduced["axis"].values if rows is None else rows, dtype=str)),
             "begin": ("window", begin[windows.first], {"units": "s"}),
             "end": ("window", end[windows.stop - 1], {"units": "s"}),
             "first": ("window", windows.first),

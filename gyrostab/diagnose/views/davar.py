@@ -73,7 +73,6 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     return view_dataset(
         "davar",
         reduced,
-        rows=[str(axis) for axis in reduced["axis"].values],
         windows=surface["windows"],
         columns=surface["columns"],
         z=cube_root_score(ratio, surface["shape"]),

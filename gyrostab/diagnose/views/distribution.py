@@ -56,7 +56,6 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     return view_dataset(
         "distribution",
         reduced,
-        rows=[str(axis) for axis in reduced["axis"].values],
         windows=windows,
         columns={"what": [*COUNTS, "kurtosis"], "tau_min_s": 1.0 / rate, "tau_max_s": 1.0 / rate, "floor": _FLOOR},
         z=z,

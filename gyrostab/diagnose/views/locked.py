@@ -59,7 +59,6 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     return view_dataset(
         "spectrum",
         reduced,
-        rows=[str(axis) for axis in reduced["axis"].values],
         windows=windows,
         columns={"what": what, "tau_min_s": tau_min, "tau_max_s": tau_max},
         z=z,

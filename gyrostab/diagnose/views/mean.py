@@ -53,7 +53,6 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     return view_dataset(
         "mean",
         reduced,
-        rows=[str(axis) for axis in reduced["axis"].values],
         windows=windows,
         columns={"what": "mean", "tau_min_s": [block], "tau_max_s": [block * max(windows.length, default=1)]},
         z=z,

@@ -53,7 +53,6 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     return view_dataset(
         "restart",
         reduced,
-        rows=[str(axis) for axis in reduced["axis"].values],
         windows=windows,
         columns={"what": what, "tau_min_s": block, "tau_max_s": tau},
         z=spread,

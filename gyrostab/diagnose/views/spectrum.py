@@ -50,7 +50,6 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     return view_dataset(
         "spectrum",
         reduced,
-        rows=[str(axis) for axis in reduced["axis"].values],
         windows=windows,
         columns={"what": "line", "tau_min_s": half, "tau_max_s": half, "frequency": frequency},
         z=z,
