@@ -15,10 +15,12 @@ from gyrostab.concealed import channel_detector, make_case, open_truth, plan_cas
 from gyrostab.concealed.catalogue import CATALOGUE, STRANGE
 from gyrostab.concealed.limits import NATS, amplitude_for, mean_size, shared_size, variance_gain, variance_size
 from gyrostab.concealed.naive import allan_detector
+from gyrostab.concealed.plan import SEVERINGS
 from gyrostab.concealed.record import signal
 from gyrostab.concealed.seal import truth_text
 from gyrostab.concealed.sever import sever
 from gyrostab.concealed.visible import FAINT
+from gyrostab.concealed.wander import wander_size
 from gyrostab.concealed.world import AXES, draw_world, stream
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.regularise import gap_table
@@ -132,6 +134,49 @@ def test_shaking_adds_the_variance_that_its_size_was_reckoned_from(name):
     assert 0.3 < alone / effect.size < 1.1  # a flat density is the weakest of all of this power, and other axes may add
 
 
+def test_rounding_of_the_rate_stands_alone_and_adds_its_white_noise():
+    log, truth = make_case(small("rate_quantization", strength=20.0))
+    step = truth["effects"][0]["parameters"]["step"]["value"]
+    counts = log.rate.values / step
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
+    assert all(noise["Q"] == 0 for noise in truth["noise"].values())
+
+
+def test_an_angle_counter_is_noise_and_no_effect():
+    """A log of angle steps stands on a lattice as well; the truth says Q of that step, and names nothing."""
+    world = draw_world(np.random.default_rng(0), rate=10.0, seconds=600.0)
+    world = replace(world, noise=tuple(noise | {"Q": 0.3} for noise in world.noise))
+    counts = signal(world, [], seed=1) / (0.3 * math.degrees(1e-6) * 3600 * math.sqrt(12) * world.rate)
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
+
+
+def test_a_dead_zone_leaves_zeros_and_a_stop_leaves_ends():
+    log, truth = make_case(small("dead_zone", strength=6.0))
+    row = log.rate.sel(axis=truth["effects"][0]["axes"][0]).values
+    assert 10 <= (row == 0).sum() <= 90  # 30 are wanted
+    log, truth = make_case(small("clipping", strength=6.0))
+    row = log.rate.sel(axis=truth["effects"][0]["axes"][0]).values
+    assert (row == np.nanmax(row)).sum() >= 10
+
+
+def test_what_is_lost_on_the_way_is_shorter_than_a_power_cut_where_starts_matter():
+    log, truth = make_case(small("warm_up", gaps=0.4, cuts=2))
+    gaps = gap_table(log)
+    long = gaps["samples"] / truth["sampling_rate_hz"] >= 5.0
+    assert long.sum() == len(truth["power_cuts"]) == 2
+
+
+def test_random_bias_has_the_size_that_the_spectrum_says():
+    world = replace(white_world(seconds=4000), noise=tuple({"N": 0.003, "B": 0.0, "K": 0.0, "Q": 0.0} for _ in AXES))
+    size, nats = wander_size(world, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.003)
+    larger, more = wander_size(world, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.006)
+    assert larger / size == pytest.approx(4.0, rel=0.1)  # faint: the log variance goes with the square
+    f = np.arange(1, world.size) / (2 * world.seconds)
+    ratio = 2 * 0.003**2 * 50 / (1 + (2 * math.pi * f * 50) ** 2) / (60 * 0.003) ** 2
+    assert size == pytest.approx(math.sqrt((ratio**2).sum() / 4 / NATS), rel=0.05)
+    assert nats < more
+
+
 def test_buried_cases_are_seen_by_neither_eye():
     plan = small("spectral_line", kind="buried", seconds=3600, heavy=False, strength=1.5)
     log, truth = make_case(plan)
@@ -198,12 +243,12 @@ def test_a_sealed_recording_is_read_as_a_log(tmp_path):
         open_truth(path, sha256=digest)
 
 
-@pytest.mark.parametrize("how", ["withheld", "decoy", "lagged", "confounded"])
+@pytest.mark.parametrize("how", SEVERINGS)
 def test_severed_driver(how):
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.normal(size=1000))
     channels = sever({"temperature": (values, 1.0), "vibration": (np.ones(1000), 1.0)}, "temperature", how=how, rng=rng)
-    assert ("temperature" in channels) == (how in ("lagged", "confounded"))
+    assert ("temperature" in channels) == (how not in ("withheld", "decoy"))
     if how == "lagged":
         lags = [np.corrcoef(values[: 1000 - k], channels["temperature"][0][k:])[0, 1] for k in range(0, 181)]
         assert np.argmax(lags) >= 30
@@ -211,13 +256,20 @@ def test_severed_driver(how):
         assert abs(np.corrcoef(values, channels["supply_voltage"][0])[0, 1]) > 0.8
     if how == "decoy":
         assert "supply_voltage" in channels
+    if how == "noisy":
+        assert 0.5 < np.corrcoef(values, channels["temperature"][0])[0, 1] < 0.9
+    if how == "clipped":
+        assert (channels["temperature"][0] == channels["temperature"][0].max()).sum() > 100
 
 
 def test_composition_of_a_benchmark():
     plans = plan_cases(400, seed=5)
     kinds = [plan["kind"] for plan in plans]
     assert kinds.count("null") == 100
-    assert kinds.count("strange") == kinds.count("severed") == kinds.count("buried") == kinds.count("pair") == 40
+    assert kinds.count("strange") == kinds.count("severed") == kinds.count("buried") == 40
+    assert (kinds.count("pair"), kinds.count("triple")) == (60, 20)
+    assert {len(plan["names"]) for plan in plans if plan["kind"] == "triple"} == {3}
+    assert all(len(set(plan["names"])) == len(plan["names"]) for plan in plans)
     single = [plan["names"][0] for plan in plans if plan["kind"] == "single"]
     assert len(set(single)) >= 14
     assert {plan["rate"] for plan in plans} == {10.0, 100.0, 400.0}

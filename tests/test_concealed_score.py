@@ -218,7 +218,7 @@ def test_sets_are_symmetric_and_the_catalogue_is_that_of_the_contract():
     for group in AMBIGUITY:
         for name in group:
             assert group <= merged(name)
-    contract = {name for group in AMBIGUITY for name in group} | {"logger_filter", "supply_bias", "held_samples"}
+    contract = {name for group in AMBIGUITY for name in group} | {"logger_filter", "supply_bias", "held_samples", "dead_zone", "clipping"}
     assert set(CATALOGUE) <= contract
 
 

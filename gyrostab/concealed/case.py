@@ -11,11 +11,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.concealed import environment
+from gyrostab.concealed import environment, telemetry
 from gyrostab.concealed.catalogue import CATALOGUE, STRANGE, Entry
 from gyrostab.concealed.plan import STRENGTHS
 from gyrostab.concealed.record import channels_of, lost, make_log, signal
 from gyrostab.concealed.sever import sever
+from gyrostab.concealed.telemetry import SHORTEST
 from gyrostab.concealed.visible import is_buried
 from gyrostab.concealed.world import AXES, Effect, World, draw_world, stream
 from gyrostab.errors import OptionError
@@ -49,9 +50,23 @@ def _world(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) -> Worl
         )
         if any(entry.needs == "dips" for entry in entries):
             world = replace(world, light=environment.light_monitor(rng, plan["seconds"], dips=True))
+        if any(entry.cuts for entry in entries):
+            world = replace(world, missing=_told_from_cuts(world))
+        if any(entry.needs == "whole angle" for entry in entries):
+            world = replace(world, noise=tuple(noise | {"Q": 0.0} for noise in world.noise))
         if _suits(world, entries):
             return world
     raise OptionError(f"case {plan['index']} of seed {plan['seed']}: no environment with {plan['names']} in it was drawn in {_TRIES} tries")
+
+
+def _told_from_cuts(world: World) -> NDArray[np.bool_]:
+    """Losses of the line so short that nobody takes them for a power cut, where an effect hangs on the starts."""
+    t = np.arange(world.size) / world.rate
+    off = np.zeros(world.size, dtype=bool)
+    for begin, end in world.cuts:
+        off |= (t >= begin) & (t < end)
+    longest = max(1, round((SHORTEST - 2.0) * world.rate))
+    return np.asarray(off & world.missing | telemetry.shortened(world.missing & ~off, longest=longest))
 
 
 def _weaker(plan: dict[str, Any], attempt: int) -> dict[str, Any]:

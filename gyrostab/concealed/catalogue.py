@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gyrostab.concealed import electronics, heat, motion, strange
+from gyrostab.concealed import electronics, heat, motion, strange, wander, words
 from gyrostab.concealed.world import Effect
 
 __all__ = ["AMBIGUITY", "CATALOGUE", "STRANGE", "Entry", "merged"]
@@ -45,6 +45,12 @@ CATALOGUE: dict[str, Entry] = {
     "bias_jump": Entry(electronics.bias_jump, cuts=1, hidden=True),
     "supply_bias": Entry(electronics.supply_bias, "supply_voltage", hidden=True),
     "feedback_reset": Entry(electronics.feedback_reset, "ramp"),
+    "rate_quantization": Entry(words.rate_quantization, needs="whole angle"),
+    "dead_zone": Entry(words.dead_zone, needs="whole angle"),
+    "clipping": Entry(words.clipping),
+    "gauss_markov": Entry(wander.gauss_markov),
+    "telegraph": Entry(wander.telegraph),
+    "ageing_bias": Entry(wander.ageing_bias, hidden=True),
 }
 
 STRANGE: dict[str, Entry] = {

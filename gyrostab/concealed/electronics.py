@@ -13,7 +13,7 @@ from gyrostab.concealed import light, loop, telemetry
 from gyrostab.concealed.environment import lag
 from gyrostab.concealed.floor import white_level
 from gyrostab.concealed.limits import NATS, shared_size
-from gyrostab.concealed.shapes import mean_effect, named, on_axes, variance_effect
+from gyrostab.concealed.shapes import by_axis, mean_effect, named, on_axes, variance_effect
 from gyrostab.concealed.world import AXES, Effect, World, to_samples
 
 __all__ = [
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 def spectral_line(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """A line that stands, or one whose phase wanders slowly."""
-    frequency = rng.uniform(0.02, 0.45) * world.rate
+    frequency = float(np.exp(rng.uniform(np.log(0.005), np.log(0.48)))) * world.rate
     wander = rng.random() < 0.5
     phase = 2 * math.pi * frequency * np.arange(world.size) / world.rate
     if wander:
@@ -41,9 +41,10 @@ def spectral_line(world: World, rng: np.random.Generator, *, strength: float) ->
         form="sine with a phase that wanders by a radian" if wander else "sine",
         differs=wander,
         tau=(max(1 / world.rate, 0.1 / frequency), 2 / frequency),
-        parameters={"frequency": {"value": frequency, "unit": "Hz"}},
+        parameters={"frequency": {"value": (phase[-1] - phase[0]) / (2 * math.pi * (world.seconds - 1 / world.rate)), "unit": "Hz"}},
     )
-    effect.parameters["amplitude"] = effect.parameters["peak"] | {"axis": AXES[int(np.argmax(np.abs(shares)))]}
+    amplitude = float(effect.parameters["peak"]["value"])
+    effect.parameters["amplitude"] = {"values": by_axis(np.abs(shares), amplitude), "unit": "deg/h"}
     return effect
 
 
@@ -51,7 +52,7 @@ def supply_bias(world: World, rng: np.random.Generator, *, strength: float) -> E
     """Bias that follows the supply, in half of the cases through a regulator that is slow and bends."""
     slow = rng.random() < 0.5
     v = world.supply - world.supply.mean()
-    shape = lag(v - 0.3 * np.minimum(v, 0) ** 2, rng.uniform(10, 60)) if slow else v
+    shape = lag(v - 0.3 * np.minimum(v, 0) ** 2, rng.uniform(5, 120)) if slow else v
     return mean_effect(
         world,
         to_samples(world, shape),
@@ -61,7 +62,7 @@ def supply_bias(world: World, rng: np.random.Generator, *, strength: float) -> E
         driver="supply_voltage",
         form="slow and bent" if slow else "proportional to the voltage",
         differs=slow,
-        regressor=("sensitivity", to_samples(world, v), "deg/h/V"),
+        regressor=("voltage", to_samples(world, v), "deg/h/V"),
     )
 
 
@@ -141,7 +142,13 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
         nats=NATS * size**2,
         tau=(1 / world.rate, 30.0),
         white=light.share_source(own, common, shares=shares),
-        parameters={"correlation": {"value": float(np.abs(rho * pairs).max()), "unit": "1"}},
+        parameters={
+            "correlation": {"value": float(np.abs(rho * pairs).max()), "unit": "1"},
+            "N": {
+                "values": {a: abs(float(r)) * n["N"] for a, r, n in zip(AXES, shares, world.noise, strict=True) if r},
+                "unit": "deg/sqrt(h)",
+            },
+        },
     )
 
 
@@ -157,7 +164,8 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
 
     def ratio(a: float) -> Array:
         response = np.exp(-1j * f[:, None] * np.arange(taps(a).size)) @ taps(a)
-        return np.asarray(np.tile(np.maximum(np.abs(response) ** 2, 1e-12), (3, 1, 1)))
+        gain = np.maximum(np.abs(response) ** 2, 1e-12)
+        return np.asarray(np.tile(gain / np.exp(np.log(gain).mean()), (3, 1, 1)))  # nobody knows the level before the filter
 
     effect, amplitude = variance_effect(
         world,
@@ -178,6 +186,8 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
         return np.asarray(first + lfilter(weights, [weights.sum()], record - first, axis=1))
 
     parameters = {"weight": {"value": amplitude, "unit": "1"}}
+    if kind == "pole":
+        parameters["cutoff"] = {"value": -math.log(min(amplitude, 0.45)) * world.rate / (2 * math.pi), "unit": "Hz", "unless": ["length"]}
     return Effect(**{**vars(effect), "after": after, "parameters": parameters})
 
 
@@ -212,7 +222,11 @@ def spikes(world: World, rng: np.random.Generator, *, strength: float) -> Effect
         nats=NATS * strength**2,
         tau=(1 / world.rate, 10 / world.rate),
         after=after,
-        parameters={"spike": {"value": lsb * 2**12, "unit": "deg/h"}, "number": {"value": number, "unit": "1"}},
+        parameters={
+            "spike": {"value": lsb * 2**12, "unit": "deg/h"},
+            "number": {"value": number, "unit": "1"},
+            "per_hour": {"value": number / (n / world.rate / 3600.0), "unit": "1/h"},
+        },
     )
 
 
@@ -223,6 +237,10 @@ def held_samples(world: World, rng: np.random.Generator, *, strength: float) -> 
     number = max(1, min(round(NATS / math.log(1e3) * strength**2) + 1, world.size // frame // 8))
     seed = int(rng.integers(2**31))
     pairs = number * (frame if hold else 1)
+    seen = telemetry.repeat_frames(np.random.default_rng(seed), np.zeros((1, world.size)), number=number, frame=frame, hold=hold)[1]
+    seen = seen[~world.missing[seen]]
+    hours = float((~world.missing).sum()) / world.rate / 3600.0
+    held = {"per_hour": {"value": seen.size / hours, "unit": "1/h"}, "length": {"value": frame / world.rate, "unit": "s"}}
     return Effect(
         name="held_samples",
         axes=AXES,
@@ -233,5 +251,5 @@ def held_samples(world: World, rng: np.random.Generator, *, strength: float) -> 
         nats=float(pairs) * math.log(1e3),
         tau=(1 / world.rate, 2 * frame / world.rate),
         after=lambda record: telemetry.repeat_frames(np.random.default_rng(seed), record, number=number, frame=frame, hold=hold)[0],
-        parameters={"number": {"value": number, "unit": "1"}, "frame": {"value": frame, "unit": "1"}},
+        parameters={"number": {"value": int(seen.size), "unit": "1"}, "frame": {"value": frame, "unit": "1"}} | (held if hold else {}),
     )

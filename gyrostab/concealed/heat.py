@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from gyrostab.concealed import coil, light
 from gyrostab.concealed.environment import lag
 from gyrostab.concealed.shapes import mean_effect, named, on_axes, variance_effect
-from gyrostab.concealed.world import Effect, World, to_samples
+from gyrostab.concealed.world import AXES, Effect, World, to_samples
 
 __all__ = ["ageing_noise", "light_power_noise", "shupe", "temperature_bias", "temperature_noise", "thermal_hysteresis", "warm_up"]
 
@@ -19,12 +19,18 @@ def shupe(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """Heat that walks through the layers of a quadrupole winding."""
     layers = int(rng.choice([16, 24, 32]))
     weights = coil.layer_weights(layers, trim=rng.normal(0, 3e-4), scatter=rng.normal(0, 2e-4, layers))
-    thickness = rng.uniform(0.007, 0.016)
+    thickness = rng.uniform(0.004, 0.022)
     padded = np.concatenate([np.full(50, world.temperature[0]), world.temperature])
     speed = np.gradient(coil.layer_temperatures(padded, dt=1.0, layers=layers, thickness=thickness), axis=1)[:, 50:]
     shape = to_samples(world, weights @ speed)
     form = f"diffusion through {layers} layers, slowest mode {coil.diffusion_time(thickness, 2.2e-7):.0f} s"
-    return mean_effect(world, shape, on_axes(rng), strength=strength, name="shupe", driver="temperature", form=form, differs=True)
+    shares = on_axes(rng)
+    effect = mean_effect(world, shape, shares, strength=strength, name="shupe", driver="temperature", form=form, differs=True)
+    steady = float(weights.sum()) / 60.0 / float(np.abs(shape).max())  # what 1 K/min gives for good, beside the largest value
+    largest = {axis: float(np.abs(row).max()) for axis, row in zip(AXES, effect.mean, strict=True)}  # type: ignore[arg-type]
+    signs = {axis: float(np.sign(share)) * steady * largest[axis] for axis, share in zip(AXES, shares, strict=True) if share}
+    effect.parameters["sensitivity"] = {"values": signs, "unit": "deg/h/(degC/min)"}
+    return effect
 
 
 def temperature_bias(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -60,19 +66,26 @@ def thermal_hysteresis(world: World, rng: np.random.Generator, *, strength: floa
     """Bias that lags behind in temperature: one play, or many of different widths."""
     many = rng.random() < 0.7
     span = float(np.ptp(world.temperature))
-    widths = span * (np.linspace(0.04, 0.35, 8) if many else np.array([rng.uniform(0.08, 0.25)]))
+    widths = span * (np.linspace(0.04, 0.35, 8) if many else np.array([rng.uniform(0.05, 0.3)]))
     shares = rng.dirichlet(np.ones(widths.size))
     loop = sum(share * (world.temperature - _play(world.temperature, width)) for share, width in zip(shares, widths, strict=True))
-    return mean_effect(
+    shares = on_axes(rng)
+    effect = mean_effect(
         world,
         to_samples(world, np.asarray(loop)),
-        on_axes(rng),
+        shares,
         strength=strength,
         name="thermal_hysteresis",
         driver="temperature",
         form="eight plays of different widths" if many else "one play",
         differs=many,
     )
+    if not many and effect.mean is not None:
+        largest = float(np.abs(np.asarray(loop)).max())
+        slopes = {a: float(np.sign(r) * np.abs(row).max()) / largest for a, r, row in zip(AXES, shares, effect.mean, strict=True) if r}
+        effect.parameters["sensitivity"] = {"values": slopes, "unit": "deg/h/degC"}
+        effect.parameters["width"] = {"value": float(widths[0]), "unit": "degC"}
+    return effect
 
 
 def since_power_on(world: World) -> Array:
@@ -87,13 +100,14 @@ def since_power_on(world: World) -> Array:
 def warm_up(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """Bias that dies away after every start: exponential, stretched, or as a power of time."""
     kind = rng.choice(["exponential", "stretched", "power"])
-    tau = rng.uniform(0.03, 0.15) * world.seconds
+    tau = float(np.exp(rng.uniform(np.log(0.015), np.log(0.25)))) * world.seconds
     x = since_power_on(world) / tau
     shape = {"exponential": np.exp(-x), "stretched": np.exp(-(x**0.6)), "power": 1 / (1 + x) ** 1.5}[str(kind)]
-    return mean_effect(
+    shares = on_axes(rng)
+    effect = mean_effect(
         world,
         to_samples(world, shape),
-        on_axes(rng),
+        shares,
         strength=strength,
         name="warm_up",
         driver=None,
@@ -101,6 +115,13 @@ def warm_up(world: World, rng: np.random.Generator, *, strength: float) -> Effec
         differs=bool(kind != "exponential"),
         active=x < 2,
     )
+    if kind == "exponential" and effect.mean is not None:
+        first = {
+            axis: float(np.sign(share) * np.abs(row).max()) for axis, share, row in zip(AXES, shares, effect.mean, strict=True) if share
+        }
+        effect.parameters["amplitude"] = {"values": first, "unit": "deg/h", "unless": ["slow_amplitude"]}
+        effect.parameters["time"] = {"value": tau, "unit": "s", "unless": ["slow_amplitude"]}
+    return effect
 
 
 def _through_power(

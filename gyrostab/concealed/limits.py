@@ -84,11 +84,16 @@ def variance_size(world: World, ratio: Array) -> float:
     return math.sqrt(float((weight * change**2).sum()) / 4 / NATS)
 
 
-def variance_gain(world: World, ratio: Array) -> float:
-    """Expected log-likelihood [nats] of the truth over noise without the effect, for the `ratio` of `variance_size`."""
+def variance_gain(world: World, ratio: Array, *, quiet: bool = True) -> float:
+    """Expected log-likelihood [nats] of the truth over noise without the effect, for the `ratio` of `variance_size`.
+
+    Without `quiet` times, in which the noise could be seen without the effect, it is compared with the mean level instead.
+    """
     weight = _weights(world, ratio)
     if ratio.shape[1] == 1:
         weight = weight.sum(axis=1, keepdims=True)
+    elif not quiet:
+        ratio = ratio * weight.sum(axis=1, keepdims=True) / (ratio * weight).sum(axis=1, keepdims=True)
     return float((weight * (ratio - 1 - np.log(ratio))).sum()) / 2
 
 

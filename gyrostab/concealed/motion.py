@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from gyrostab.concealed import tool, vibration
-from gyrostab.concealed.floor import floor_psd
-from gyrostab.concealed.shapes import mean_effect, named, on_axes, variance_effect
+from gyrostab.concealed.floor import floor_psd, white_level
+from gyrostab.concealed.shapes import by_axis, mean_effect, named, on_axes, variance_effect
 from gyrostab.concealed.world import AXES, QUICK, Effect, World, to_samples
 
 __all__ = ["aliased_vibration", "earth_rate", "misalignment", "rotation_line", "scale_factor", "vibration_noise", "vibration_rectification"]
@@ -22,8 +23,8 @@ _BANDS = 24
 
 def vibration_rectification(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """Mean that shaking leaves: not quite a square, and saturating."""
-    exponent = float(rng.choice([1.7, 1.9, 2.0, 2.2]))
-    saturation = float(rng.choice([8.0, 15.0, np.inf]))
+    exponent = 2.0 if rng.random() < 0.4 else float(rng.uniform(1.6, 2.4))
+    saturation = float(rng.choice([8.0, 15.0, np.inf, np.inf]))
     shape = vibration.rectify(world.vibration, exponent=exponent, saturation=saturation)
     return mean_effect(
         world,
@@ -32,7 +33,7 @@ def vibration_rectification(world: World, rng: np.random.Generator, *, strength:
         strength=strength,
         name="vibration_rectification",
         driver="vibration",
-        form=f"power {exponent:g} of the rms, saturating at {saturation:g} g",
+        form=f"power {exponent:.3g} of the rms, saturating at {saturation:g} g",
         differs=not (exponent == 2.0 and math.isinf(saturation)),
         active=world.busy,
         regressor=("sensitivity", to_samples(world, world.vibration**2), "deg/h/g^2"),
@@ -88,7 +89,11 @@ def _shaking_noise(
         active=world.busy,
     )
     extra = np.stack([amplitude * _shaken(world, rng, share, band=band, mount=mount, kind=kind) for share in shares])
-    return Effect(**{**vars(effect), "extra": extra, "parameters": {"sensitivity_at_4_khz": {"value": amplitude, "unit": "deg/h/g"}}})
+    parameters: dict[str, Any] = {"sensitivity_at_4_khz": {"value": amplitude, "unit": "deg/h/g"}}
+    if name == "vibration_noise":  # white noise of the same power is what a flat model should find
+        white = by_axis(np.abs(shares), amplitude * math.sqrt(float(density.mean())) / white_level(1.0))
+        parameters["white"] = {"values": white, "unit": "deg/sqrt(h)/g", "unless": ["quantization", "exponent"]}
+    return Effect(**{**vars(effect), "extra": extra, "parameters": parameters})
 
 
 def vibration_noise(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -195,7 +200,7 @@ def scale_factor(world: World, rng: np.random.Generator, *, strength: float) -> 
         form="linear and cubic in the rotation rate" if bend else "proportional to the rotation rate",
         differs=bend,
         active=_turning(world),
-        regressor=("error", to_samples(world, world.rotation, dt=QUICK) * 3600.0 * 1e-6, "ppm"),
+        regressor=("linear", to_samples(world, world.rotation, dt=QUICK) * 3600.0 * 1e-6, "ppm"),
     )
 
 
@@ -223,5 +228,5 @@ def misalignment(world: World, rng: np.random.Generator, *, strength: float) -> 
     angle = float(rng.uniform(2e-4, 2e-3) * rng.choice([-1.0, 1.0]))
     mean = leak.mean.copy()
     mean[2] = mean[int(np.argmax(np.abs(shares)))] / angle
-    parameters = leak.parameters | {"angle": {"value": 1e3 * angle, "unit": "mrad", "axis": AXES[int(np.argmax(shares))]}}
+    parameters = leak.parameters | {"z": {"values": {AXES[int(np.argmax(shares))]: 1e3 * angle}, "unit": "mrad"}}
     return Effect(**{**vars(leak), "mean": mean, "parameters": parameters, "beside": ("real_motion", "scale_factor")})

@@ -13,13 +13,23 @@ from gyrostab.errors import OptionError
 __all__ = ["KINDS", "SEVERINGS", "STRENGTHS", "plan_case", "plan_cases"]
 
 #: Kind of case -> how many of 20 are of it. "single" and "buried" hold one effect, "strange" one that is in no catalogue.
-KINDS = {"null": 5, "single": 7, "buried": 2, "pair": 2, "strange": 2, "severed": 2}
+KINDS = {"null": 5, "single": 5, "buried": 2, "pair": 3, "triple": 1, "strange": 2, "severed": 2}
 
 #: Sizes in units of the closed-form limit.
 STRENGTHS = (0.5, 1.0, 1.5, 2.5, 4.0, 8.0)
 
 #: What can be done to the channel that drives an effect.
-SEVERINGS = ("withheld", "decoy", "lagged", "confounded")
+SEVERINGS = ("withheld", "decoy", "lagged", "confounded", "noisy", "clipped")
+
+#: Effects that are not put into one record: the one makes the limit of the other meaningless.
+_APART = (
+    {"logger_filter", "spikes"},
+    {"rate_quantization", "dead_zone"},
+    {"rate_quantization", "clipping"},
+    {"rate_quantization", "spikes"},
+    {"clipping", "spikes"},
+    {"gauss_markov", "telegraph"},
+)
 
 
 def _pool(kind: str) -> list[tuple[str, float]]:
@@ -91,8 +101,8 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
     if kind != "null":
         name, strength = _dealt(seed, kind, before)
         names, strengths = [name], [strength]
-    if kind == "pair":
-        others = [other for other in CATALOGUE if other != names[0] and {other, names[0]} != {"logger_filter", "spikes"}]
+    for _ in range({"pair": 1, "triple": 2}.get(kind, 0)):
+        others = [other for other in CATALOGUE if other not in names and not any({other, name} in _APART for name in names)]
         names.append(str(rng.choice(others)))
         strengths.append(float(rng.choice(STRENGTHS)))
     channel = (CATALOGUE | STRANGE)[names[0]].channel if names else None

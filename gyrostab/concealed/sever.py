@@ -1,4 +1,4 @@
-"""Take the driving channel away, or make it lie: withheld, replaced by a look-alike, late, or moving together with another."""
+"""Take the driving channel away, or make it lie: withheld, replaced by a look-alike, late, noisy, clipped, or moving with another."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def sever(channels: Channels, driver: str, *, how: str, rng: np.random.Generator
         Name to values and rate [Hz].
     driver : str
         The channel that drives the effect.
-    how : {"withheld", "decoy", "lagged", "confounded"}
+    how : {"withheld", "decoy", "lagged", "confounded", "noisy", "clipped"}
         Left out; left out, with a channel of the same manner at other times; late by 30 to 180 s; joined by another
-        channel that moves with it.
+        channel that moves with it; noisy by its own standard deviation; clipped at the upper half of its range.
     rng : numpy.random.Generator
 
     Raises
@@ -66,6 +66,10 @@ def sever(channels: Channels, driver: str, *, how: str, rng: np.random.Generator
     elif how == "confounded":
         name, like = _stand_in(driver, values, rng)
         left[name] = (like, rate)
+    elif how == "noisy":
+        left[driver] = (values + rng.normal(0.0, float(values.std()), values.size), rate)
+    elif how == "clipped":
+        left[driver] = (np.minimum(values, 0.5 * (values.min() + values.max())), rate)
     else:
-        raise OptionError(f"how={how!r}: give 'withheld', 'decoy', 'lagged' or 'confounded'")
+        raise OptionError(f"how={how!r}: give 'withheld', 'decoy', 'lagged', 'confounded', 'noisy' or 'clipped'")
     return left

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
+from gyrostab.concealed.floor import floor_psd
 from gyrostab.concealed.limits import NATS, amplitude_for, mean_size, variance_gain, variance_size
 from gyrostab.concealed.world import AXES, Effect, World
 
-__all__ = ["mean_effect", "on_axes", "projection", "variance_effect"]
+__all__ = ["by_axis", "mean_effect", "named", "on_axes", "projection", "variance_effect"]
 
 Array = NDArray[np.float64]
 
@@ -31,11 +33,18 @@ def named(shares: Array) -> tuple[str, ...]:
     return tuple(axis for axis, share in zip(AXES, shares, strict=True) if share != 0)
 
 
-def projection(world: World, mean: Array, driver: Array, *, unit: str) -> dict[str, Any]:
-    """Sensitivity of a mean (time,) to a driver (time,) by least squares over the samples present: what a linear model should find."""
+def by_axis(shares: Array, value: float) -> dict[str, float]:
+    """`value` times the share of every axis that has one."""
+    return {axis: float(value * share) for axis, share in zip(AXES, shares, strict=True) if share != 0}
+
+
+def projection(world: World, mean: Array, driver: Array, *, axis: int) -> float:
+    """Sensitivity of a mean (time,) to a driver (time,) by least squares in the noise of an axis: what a linear model should find."""
     there = ~world.missing
-    x = driver[there] - driver[there].mean()
-    return {"value": float(x @ mean[there] / (x @ x)), "unit": unit}
+    x, y = (fft.dct(np.where(there, values - values[there].mean(), 0.0), norm="ortho")[1:] for values in (driver, mean))
+    f = np.arange(1, world.size) * world.rate / (2 * world.size)
+    weight = 1.0 / floor_psd(f, noise=world.noise[axis], rate=world.rate)
+    return float((weight * x * y).sum() / (weight * x * x).sum())
 
 
 def mean_effect(
@@ -67,7 +76,7 @@ def mean_effect(
     name, driver, form, differs, tau, active
         See `Effect`.
     regressor : (str, ndarray, str), optional
-        Name of a parameter, the driver it multiplies (time,) and its unit: its value is the projection of the mean.
+        Name of a parameter, the driver it multiplies (time,) and its unit: its value on every axis is the projection of the mean.
 
     Returns
     -------
@@ -79,8 +88,8 @@ def mean_effect(
     parameters["peak"] = {"value": float(np.abs(mean - np.median(mean, axis=1, keepdims=True)).max()), "unit": "deg/h"}
     parameters["size_white"] = {"value": mean_size(world, mean, white=True), "unit": "1"}
     if regressor is not None:
-        first = int(np.argmax(np.abs(shares)))
-        parameters[regressor[0]] = projection(world, mean[first], regressor[1], unit=regressor[2]) | {"axis": AXES[first]}
+        values = {axis: projection(world, mean[i], regressor[1], axis=i) for i, axis in enumerate(AXES) if shares[i]}
+        parameters[regressor[0]] = {"values": values, "unit": regressor[2]}
     return Effect(
         name=name,
         axes=named(shares),
@@ -138,7 +147,7 @@ def variance_effect(
         form=form,
         differs=differs,
         size=variance_size(world, final),
-        nats=variance_gain(world, final),
+        nats=variance_gain(world, final, quiet=active is not None),
         tau=tau or (1 / world.rate, 30.0),
         active=active,
         variance=final if final.ndim == 2 and final.shape[1] > 1 else None,

@@ -7,9 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["flip_bits", "lose", "power_cuts", "repeat_frames"]
+__all__ = ["flip_bits", "lose", "power_cuts", "repeat_frames", "shortened"]
 
 Array = NDArray[np.float64]
+
+#: Shortest power cut [s]; what comes from the line alone is shorter where an effect hangs on the starts.
+SHORTEST = 6.0
 
 
 def lose(rng: np.random.Generator, size: int, *, share: float, frame: int, burst: float = 1.0) -> NDArray[np.bool_]:
@@ -48,6 +51,23 @@ def lose(rng: np.random.Generator, size: int, *, share: float, frame: int, burst
     return np.asarray(np.repeat(bad, frame)[:size])
 
 
+def shortened(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
+    """The same losses, none of them longer than `longest` samples: of longer ones every so often a piece came through.
+
+    Examples
+    --------
+    >>> shortened(np.ones(10, bool), longest=4).astype(int).tolist()
+    [1, 1, 1, 1, 0, 1, 1, 1, 1, 0]
+    """
+    out = lost.copy()
+    back = max(1, longest // 4)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]))).reshape(-1, 2)
+    for begin, end in edges[edges[:, 1] - edges[:, 0] > longest].tolist():
+        for first in range(begin + longest, end, longest + back):
+            out[first : min(first + back, end)] = False
+    return out
+
+
 def power_cuts(rng: np.random.Generator, seconds: float, *, number: int) -> Array:
     """Begin and end [s] of `number` power cuts, each in a part of the record of its own, shape (number, 2).
 
@@ -59,7 +79,7 @@ def power_cuts(rng: np.random.Generator, seconds: float, *, number: int) -> Arra
     """
     part = seconds / (number + 0.5)
     begin = (np.arange(number) + rng.uniform(0.45, 0.75, number)) * part
-    off = rng.uniform(0.01, 0.12, number) * part
+    off = np.maximum(rng.uniform(0.01, 0.12, number) * part, SHORTEST)
     return np.stack([begin, begin + off], axis=1)
 
 

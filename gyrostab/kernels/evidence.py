@@ -15,11 +15,40 @@ from gyrostab.kernels.compiled import KERNEL
 __all__ = ["mixed_evidence"]
 
 Array = NDArray[np.float64]
-#: What is this much less likely than the best, as a logarithm, adds nothing that counts.
-_NEGLIGIBLE = 36.0
+#: What is this much less likely than the best, as a logarithm, adds nothing that counts: it is taken for so likely.
+_NEGLIGIBLE = 40.0
 
 
 @njit(**KERNEL)
+def _terms(base: Array, rotated: Array, constant: Array, share: Array) -> tuple[Array, Array]:
+    """Logarithm of every term of the mixture less the largest of its record, (record, width x grid), and that largest one."""
+    records, grid, p = rotated.shape
+    kinds = constant.shape[0]
+    out = np.empty((records, kinds * grid))
+    best = np.empty(records)
+    square = np.empty((p, grid))
+    peak = np.empty(grid)
+    for r in range(records):
+        for g in range(grid):
+            for j in range(p):
+                square[j, g] = rotated[r, g, j] * rotated[r, g, j]
+        peak[:] = -np.inf
+        for k in range(kinds):
+            row = out[r, k * grid : (k + 1) * grid]
+            for g in range(grid):
+                row[g] = base[r, g] + constant[k, g]
+            for j in range(p):
+                for g in range(grid):
+                    row[g] += share[k, j, g] * square[j, g]
+            for g in range(grid):
+                peak[g] = row[g] if row[g] > peak[g] else peak[g]
+        best[r] = peak.max()
+        for i in range(kinds * grid):
+            below = out[r, i] - best[r]
+            out[r, i] = below if below > -_NEGLIGIBLE else -_NEGLIGIBLE
+    return out, best
+
+
 def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Array) -> Array:
     """Log marginal likelihood of every record over grid points, and widths of the prior, of equal weight.
 
@@ -38,33 +67,8 @@ def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Arra
     -------
     ndarray, shape (record,)
     """
-    records, grid, p = rotated.shape
-    kinds = widths.size
-    share = np.empty((grid, kinds, p))
-    constant = np.empty((grid, kinds))
-    for g in range(grid):
-        for k in range(kinds):
-            constant[g, k] = -np.log(kinds)
-            for j in range(p):
-                share[g, k, j] = 0.5 * widths[k] / (1.0 + widths[k] * eigenvalues[g, j])
-                constant[g, k] -= 0.5 * np.log1p(widths[k] * eigenvalues[g, j])
-    out = np.empty(records)
-    terms = np.empty(grid * kinds)
-    square = np.empty(p)
-    for r in range(records):
-        best = -np.inf
-        for g in range(grid):
-            for j in range(p):
-                square[j] = rotated[r, g, j] * rotated[r, g, j]
-            for k in range(kinds):
-                value = base[r, g] + constant[g, k]
-                for j in range(p):
-                    value += share[g, k, j] * square[j]
-                terms[g * kinds + k] = value
-                best = max(best, value)
-        total = 0.0
-        for i in range(terms.size):
-            if terms[i] > best - _NEGLIGIBLE:
-                total += np.exp(terms[i] - best)
-        out[r] = best + np.log(total)
-    return out
+    spread = 1.0 + widths[:, None, None] * eigenvalues.T  # (width, p, grid)
+    share = 0.5 * widths[:, None, None] / spread
+    constant = -np.log(widths.size) - 0.5 * np.log(spread).sum(axis=1)
+    terms, best = _terms(base, rotated, constant, share)
+    return np.asarray(best + np.log(np.exp(terms, out=terms).sum(axis=1)))  # numpy takes many exponentials at once
