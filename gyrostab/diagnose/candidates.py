@@ -226,6 +226,10 @@ def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
     except KeyError:
         grid = {}
     grid |= {item.name: item.choices for item in kind.parameters() if item.choices}
+    known = kind.example().points(windows)
+    if known:
+        yield from (dict(point) for point in known)
+        return
     points = list(product(*grid.values()))
     for point in points[:: max(1, -(-len(points) // _MOST_VARIANTS))]:
         yield {name: value if isinstance(value, str) else float(value) for name, value in zip(grid, point, strict=True)}

@@ -240,6 +240,10 @@ class Effect:
         """Parameters in which the effect is not linear -> values worth a try on these data."""
         return {}
 
+    def points(self, windows: Windows) -> list[Mapping[str, float]]:
+        """Points of the grid of these parameters, where not all combinations of their values make sense; empty where all do."""
+        return []
+
     def explain(self, windows: Windows) -> Prediction:
         """Predict the reduced data, with the non-linear parameters at their values."""
         raise NotImplementedError

@@ -32,7 +32,8 @@ class LoggerFilter(Effect):
     Low-pass: Butterworth of `order` poles with half power at `cutoff`, made digital by the bilinear transform. Then a moving average
     over `length`. Then the samples of the log: the mean of those of the instrument (integrate and dump), or with ``pick = 1`` every
     n-th of them, n the `oversampling` of the model, so that what the filter lets through above half of the log's rate folds down. All
-    are causal and remember from chunk to chunk.
+    are causal and remember from chunk to chunk. Where it is to explain a recording, `instrument` is this n: 1 for a filter at the rate of
+    the log, 0 for an instrument much faster than it; a simulation has the model's.
 
     *DAVAR*: less at times below ``1 / cutoff`` or `length`, where sigma grows with tau as if of K or R; nothing at long times. Picked
     without a filter: more white noise at all times, n times the variance. *Window mean*: nothing. *Spectrum*: multiplied by
@@ -62,11 +63,12 @@ class LoggerFilter(Effect):
     order: float = parameter("1", "poles of the low-pass", default=2.0, low=1.0, high=12.0)
     length: float = parameter("s", "length of the moving average; 0 for none", default=0.0, low=0.0, high=1e4)
     pick: float = parameter("1", "1: every n-th sample of the instrument; 0: means of n", default=0.0, low=0.0, high=1.0)
+    instrument: float = parameter("1", "n, where it is to explain a recording; 0: many", default=0.0, low=0.0, high=1000.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _whole(self, "order")
-        _whole(self, "pick")
+        for name in ("order", "pick", "instrument"):
+            _whole(self, name)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """The sections of the low-pass and the length of the average; no samples yet."""
@@ -109,17 +111,27 @@ class LoggerFilter(Effect):
             signal = signal[:, :: chunk.setup.oversampling]
         return signal, (sections, inner, taps, memory)
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Cutoffs and lengths about the log's rate."""
-        cutoff = np.concatenate([[0.0], np.geomspace(0.05, 0.48, 11)])
-        return {"cutoff": windows.rate * cutoff, "length": np.array([0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0]) / windows.rate}
+    def points(self, windows: Windows) -> list[Mapping[str, float]]:
+        """Low-passes at the rate of the log and of fast instruments, averaged or picked, and averages; never two filters at once."""
+        cutoff = windows.rate * np.geomspace(0.02, 1.5, 27)
+        found: list[dict[str, float]] = []
+        for order in (1.0, 2.0, 4.0):
+            found += [{"cutoff": f, "order": order, "instrument": 1.0} for f in cutoff[cutoff < 0.49 * windows.rate].tolist()]
+            found += [{"cutoff": f, "order": order, "instrument": 0.0} for f in cutoff.tolist()]
+        found += [{"cutoff": f, "order": 1.0, "instrument": 0.0, "pick": 1.0} for f in cutoff.tolist()]
+        found += [{"length": taps / windows.rate, "instrument": 1.0} for taps in (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)]
+        found += [{"length": taps / windows.rate, "instrument": 0.0} for taps in (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)]
+        nothing = {"cutoff": 0.0, "order": 2.0, "length": 0.0, "pick": 0.0, "instrument": 0.0}
+        return [nothing | point for point in found]
 
     def explain(self, windows: Windows) -> Prediction:
-        """By what the spectrum of white noise is multiplied, for an instrument much faster than the log."""
+        """By what the spectrum of white noise is multiplied."""
         from gyrostab.kernels.coloured import folded_psd
 
         if not (self.cutoff or self.length):
             return Prediction()
+        if self.instrument:
+            return Prediction(response=self._digital(windows.frequency, windows.rate))
         highest = min(20.0 * self.cutoff if self.cutoff else math.inf, 50.0 / self.length if self.length else math.inf)
 
         def gain(f: Array) -> Array:
@@ -128,11 +140,27 @@ class LoggerFilter(Effect):
 
         return Prediction(response=folded_psd(gain, windows.frequency, windows.rate, max(highest, windows.rate), average=not self.pick))
 
+    def _digital(self, frequency: Array, rate: float) -> Array:
+        """For an instrument of `instrument` samples in one of the log: all frequencies of its samples that look the same in the log."""
+        n = int(self.instrument)
+        fast = n * rate
+        if self.cutoff >= fast / 2.0:
+            raise OptionError(f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of the instrument's {fast:g} Hz")
+        f = np.asarray(frequency, np.float64)[..., None] + rate * np.arange(n)
+        response = np.ones_like(f)
+        if self.cutoff:
+            ratio = np.tan(np.pi * f / fast) / math.tan(math.pi * self.cutoff / fast)
+            response = 1.0 / (1.0 + ratio ** (2 * int(self.order)))
+        for taps in (max(1, round(self.length * fast)), 1 if self.pick else n):
+            if taps > 1:  # mean of so many samples
+                response = response * (np.sin(np.pi * taps * f / fast) / (taps * np.sin(np.pi * f / fast))) ** 2
+        return np.asarray(response.sum(axis=-1))
+
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
         parts = [f"low-pass of order {int(self.order)} at {self.quantity('cutoff', errors)}"] if self.cutoff else []
         parts += [f"average over {self.quantity('length', errors)}"] if self.length else []
-        taken = "picked" if self.pick else "means"
+        taken = "filtered at the rate of the log" if self.instrument == 1.0 else "picked" if self.pick else "means"
         return f"The logger filters {self.on_axes()}: {', '.join(parts) or 'nothing'}; its samples are {taken}."
 
 
