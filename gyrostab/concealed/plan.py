@@ -50,15 +50,19 @@ def _dealt(seed: int, kind: str, turn: int) -> tuple[str, float]:
     return name, strength
 
 
-def _shape(rng: np.random.Generator, kind: str) -> tuple[float, float]:
-    """Rate [Hz] and length [s]."""
-    if kind == "buried":
-        return 10.0, round(float(np.exp(rng.uniform(np.log(7200), np.log(28800)))))
-    if rng.random() < 0.02:
-        return 10.0, 86400.0
+def _shape(rng: np.random.Generator, kind: str, index: int) -> tuple[float, float]:
+    """Rate [Hz] and length [s]: many short records, few long ones, one of a day in 400."""
+    draw = float(rng.random())
     rate = float(rng.choice([10.0, 100.0, 400.0], p=[0.4, 0.45, 0.15]))
-    longest = {10.0: 10800.0, 100.0: 3000.0, 400.0: 900.0}[rate]
-    return rate, round(float(np.exp(rng.uniform(np.log(600.0), np.log(longest)))))
+    if index % 400 == 150:
+        return 10.0, 86400.0
+    if kind == "buried":
+        rate, shortest, longest = 10.0, 3000.0, 9000.0
+    elif draw < 0.03:
+        rate, shortest, longest = 10.0, 7200.0, 21600.0
+    else:
+        shortest, longest = 600.0, {10.0: 4500.0, 100.0: 2400.0, 400.0: 900.0}[rate]
+    return rate, round(float(np.exp(rng.uniform(np.log(shortest), np.log(longest)))))
 
 
 def plan_case(index: int, *, seed: int) -> dict[str, Any]:
@@ -96,7 +100,7 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
     kind = deck[int(order[place])]
     before = sum(deck[int(order[i])] == kind for i in range(place)) + lap * KINDS[kind]
     rng = stream(seed, "plan", index)
-    rate, seconds = _shape(rng, kind)
+    rate, seconds = _shape(rng, kind, index)
     names, strengths = [], []
     if kind != "null":
         name, strength = _dealt(seed, kind, before)
