@@ -212,7 +212,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     bounds = {variable.attrs["bounds"]: name for name, variable in stored.variables.items() if "bounds" in variable.attrs}
     variables: dict[Any, xr.Variable] = {}
     grids = declared_grids(stored)
-    axes, close = _axes(stored, grids, where), stored.close
+    axes, close = _axes(stored, grids, where), stored._close
     stored = stored.rename_dims({index_dim(rule["dim"]): rule["dim"] for rule in grids.values() if index_dim(rule["dim"]) in stored.dims})
     for name, variable in stored.variables.items():
         if name in grids:

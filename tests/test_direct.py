@@ -16,7 +16,7 @@ from gyrostab.fit import fit_noise, fit_part
 from gyrostab.join import join_logs
 from gyrostab.join.lazy import lay
 from gyrostab.run import checkpoint, load_log, run
-from gyrostab.store import read
+from gyrostab.store import read, write
 from gyrostab.store.direct import can_fill, fill_row
 from gyrostab.store.header import read_header
 
@@ -100,6 +100,27 @@ def test_stored_samples_are_those_of_dask(tmp_path, form):
                 found = np.full(end - begin, 7.0)
                 fill_row(data, row, begin, found)
                 np.testing.assert_array_equal(found, expected[begin:end])
+
+
+@pytest.mark.parametrize("form", ["nc", "zarr"])
+@pytest.mark.parametrize("unit", [0.02, 0.05])
+def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, form, unit):
+    monkeypatch.setattr(write, "STRETCH_BYTES", 2**21)  # two stretches of 131072 samples of either axis, so that room is used again
+    log = opened(stored_logs(tmp_path, form))
+    log.rate.encoding = {**log.rate.encoding, "scale_factor": unit}
+    slow = log.assign({name: log[name].copy(data=log[name].data.map_blocks(np.array)) for name in ("rate", "temperature")})
+    slow.rate.encoding = log.rate.encoding
+    assert not can_fill(slow.rate.data)
+    store = {"nc": to_netcdf, "zarr": to_zarr}[form]
+    found = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error" if unit == 0.02 else "ignore")  # of the other unit not every value is a multiple
+        for name, one in (("quick", log), ("slow", slow)):
+            found.append(open_log(store(one, tmp_path / f"{name}.{form}")))
+    assert found[0].rate.encoding == found[1].rate.encoding
+    assert ("scale_factor" in found[0].rate.encoding) == (unit == 0.02)
+    xr.testing.assert_equal(found[0].compute(), found[1].compute())
+    np.testing.assert_array_equal(found[0].rate.values, log.rate.values)
 
 
 def test_a_zarr_log_is_opened_as_xarray_opens_it(tmp_path, monkeypatch):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -89,13 +89,13 @@ def join_logs(
     coordinates = xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps}).merge(time_coordinate(start, rate, size)).coords
     variables = {name: signal, **channels, **gap_variables(name_lost(join_gaps(pieces), lost, start, rate), start, rate)}
     joined = xr.Dataset(variables, coordinates, _attributes(sources, size, [*notes, *_absent(sources, axes)]))
-    joined.set_close(partial(_close, logs))
+    joined.set_close(partial(_close, [log._close for log in logs if log._close is not None]))  # and nothing else of them
     return joined
 
 
-def _close(logs: Sequence[xr.Dataset]) -> None:
-    for log in logs:
-        log.close()
+def _close(files: Sequence[Callable[[], None]]) -> None:
+    for close in files:
+        close()
 
 
 def _check_same(sources: Sequence[Source]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ class Source:
     rate: float
     size: int
 
-    @property
+    @cached_property
     def end(self) -> int:
         """Stamp of the last sample [ns since 1970]."""
         return int(grid_times(self.start, self.rate, self.size - 1))

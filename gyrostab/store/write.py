@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.kernels.counts import to_counts
+from gyrostab.store.direct import can_fill, fill_row, with_fill
 from gyrostab.store.lock import library_lock
 
 __all__ = ["Misfit", "Progress", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "common_packing", "long_variables"]
@@ -60,6 +61,8 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
     data = variable.data
     lazy = variable.chunks is not None
     packed = data.map_blocks(pack, dtype=dtype, meta=np.empty((0,) * variable.ndim, dtype)) if lazy else pack(data)
+    if lazy and can_fill(data):
+        packed = with_fill(packed, partial(_fill_counts, data, pack))
     return xr.Variable(
         variable.dims, packed, {**variable.attrs, "scale_factor": float(scale), "_FillValue": np.dtype(dtype).type(FILLS[dtype])}
     )
@@ -70,6 +73,15 @@ def _counts(values: NDArray[np.float64], *, name: str, scale: float, dtype: str)
     if counts is None:
         raise Misfit(name)
     return counts
+
+
+def _fill_counts(
+    data: Any, pack: Callable[[NDArray[np.float64]], NDArray[np.integer[Any]]], row: int, begin: int, out: NDArray[np.integer[Any]]
+) -> None:
+    """Counts of one row of `data` from `begin` on, read without dask."""
+    values = np.empty(out.size)
+    fill_row(data, row, begin, values)
+    out[:] = pack(values)
 
 
 def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
@@ -167,6 +179,7 @@ def _copy(
 ) -> None:
     """Compute lazy variables a few chunks at a time, for all of them at once, and write each chunk while the next ones are computed."""
     import dask
+    from dask.system import CPU_COUNT
 
     def write(parts: list[tuple[str, tuple[int, ...], int]], blocks: Sequence[NDArray[Any]]) -> None:
         for (name, row, begin), block in zip(parts, blocks, strict=True):
@@ -174,12 +187,13 @@ def _copy(
                 piece = block[..., at : at + lengths[name]]
                 put(name, row, slice(begin + at, begin + at + piece.shape[-1]), piece)
 
-    with ThreadPoolExecutor(1, thread_name_prefix="gyrostab-write") as pool:
+    readers = ThreadPoolExecutor(dask.config.get("num_workers", None) or CPU_COUNT, thread_name_prefix="gyrostab-read")
+    with readers, ThreadPoolExecutor(1, thread_name_prefix="gyrostab-write") as pool:
         writing: Future[None] | None = None
         done, total = 0, sum(variable.size for variable in long.values())
-        for parts in _stretches(long, lengths):
-            arrays = [_part(long[name], row, begin, span) for name, row, begin, span in parts]
-            blocks = dask.compute(*arrays)
+        rooms: tuple[_Room, _Room] = ({}, {})  # one is written while the other is filled
+        for number, parts in enumerate(_stretches(long, lengths)):
+            blocks = _blocks(long, lengths, parts, readers, rooms[number % 2])
             if writing is not None:
                 writing.result()
             writing = pool.submit(write, [part[:3] for part in parts], blocks)
@@ -190,8 +204,41 @@ def _copy(
             writing.result()
 
 
-def _part(variable: xr.Variable, row: tuple[int, ...], begin: int, span: int) -> Any:
-    return variable.data[(*row, slice(begin, begin + span))]
+#: Name, row, first sample and number of samples of a part of a variable; arrays by name and row, which stretch after stretch goes through.
+_Part = tuple[str, tuple[int, ...], int, int]
+_Room = dict[tuple[str, tuple[int, ...]], NDArray[Any]]
+
+
+def _blocks(
+    long: dict[str, xr.Variable], lengths: dict[str, int], parts: list[_Part], readers: ThreadPoolExecutor, room: _Room
+) -> list[NDArray[Any]]:
+    """Read the parts of a stretch, chunk by chunk where it is known how; dask computes the others, and walks its whole graph each time."""
+    import dask
+
+    lazy = [long[name].data[(*row, slice(begin, begin + span))] for name, row, begin, span in parts if not can_fill(long[name].data)]
+    blocks: list[NDArray[Any]] = []
+    filling: list[Future[None]] = []
+    computed = iter(dask.compute(*lazy))
+    for name, row, begin, span in parts:
+        data = long[name].data
+        if not can_fill(data):
+            blocks.append(next(computed))
+            continue
+        if room.get((name, row), _NOTHING).size < span:
+            room[name, row] = np.empty(span, data.dtype)
+        blocks.append(room[name, row][:span])
+        for at in range(0, span, lengths[name]):
+            filling.append(readers.submit(fill_row, data, row[0] if row else 0, begin + at, blocks[-1][at : at + lengths[name]]))
+    try:
+        for one in filling:
+            one.result()
+    finally:
+        for one in filling:
+            one.cancel()
+    return blocks
+
+
+_NOTHING = np.empty(0)
 
 
 def _stretches(long: dict[str, xr.Variable], lengths: dict[str, int]) -> Iterator[list[tuple[str, tuple[int, ...], int, int]]]:
