@@ -188,6 +188,19 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
     ("table", "words"),
     [
         ({"name": "shupe", "sensitivity": 0.1, "transient": 0.2}, r"0.2 deg/h/\(degC/min\) while heat goes through the winding"),
+        ({"name": "shupe", "sensitivity": 0.0, "transient": 0.2}, r"temperature on all axes, by 0.2 deg/h/\(degC/min\) while heat goes"),
+        ({"name": "temperature_bias", "sensitivity": 0.0, "cubic": 1e-6}, r"on all axes, by 1e-06 deg/h/degC\^3 around 25 degC"),
+        ({"name": "temperature_bias", "sensitivity": 0.1, "cubic": 1e-6}, r"by 0.1 deg/h/degC, 1e-06 deg/h/degC\^3 around 25 degC"),
+        ({"name": "temperature_bias", "sensitivity": 0.0}, r"by 0 deg/h/degC around 25 degC"),
+        ({"name": "temperature_noise", "linear": 0.0, "quadratic": 1e-5}, r"N\^2 changes by 1e-05 1/degC\^2 of itself around 25 degC"),
+        (
+            {"name": "vibration_rectification", "sensitivity": 0.0, "quartic": 1e-6},
+            r"of 1e-06 deg/h/g\^4 times the fourth power of the rms vib",
+        ),
+        (
+            {"name": "vibration_rectification", "sensitivity": 1e-3, "quartic": 1e-6},
+            r"of the rms vibration, and of 1e-06 deg/h/g\^4 times its",
+        ),
         ({"name": "thermal_gradient", "change": 0.1, "driver": ["a", "b"]}, "difference of a and b on all axes, by 0.1 deg/h/"),
         ({"name": "warm_up", "amplitude": 0.1, "slow_amplitude": 0.2}, "settles with 600 s, and 0.2 deg/h with 3600 s"),
         ({"name": "ageing_bias", "logarithmic": 0.2}, "by 0.2 deg/h times the logarithm of time over 24 h"),

@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 _TITLES = {"recording": "Recording", "before": "Simulation before", "after": "Simulation after"}
 _STYLES: dict[str, dict[str, Any]] = {
     "recording": {"color": "black", "lw": 0.0, "marker": "o", "ms": 3.0},
-    "before": {"color": COLOURS[1], "lw": 1.6, "ls": "--"},
-    "after": {"color": COLOURS[0], "lw": 1.6},
+    "before": {"color": COLOURS[1], "lw": 1.6, "ls": "--", "zorder": 3},  # seen where both are one
+    "after": {"color": COLOURS[0], "lw": 1.6, "zorder": 2.5},
 }
 _MOST_CHANNELS = 3
 _PALE = 0.3  # opacity of what chance does in 95 of 100
@@ -115,7 +115,8 @@ def _maps(
                 panel.set_xlabel(f"time since the start [{unit}]")
     label_log_axis(panels[0, 0].yaxis, tau[0], tau[-1])
     bar = ScalarMappable(norm, cmap)  # the maps may be partly transparent
-    figure.colorbar(bar, cax=figure.add_axes((0.912, 0.6 / height, 0.013, 1.0 - 0.95 / height)), label=label)
+    scale = figure.colorbar(bar, cax=figure.add_axes((0.912, 0.6 / height, 0.013, 1.0 - 0.95 / height)), label=label)
+    label_log_axis(scale.ax.yaxis, norm.vmin, norm.vmax)
     return figure
 
 
@@ -155,7 +156,7 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.sqrt(recording / avar.sel(case=name).values)
             usual = (recording >= low.sel(case=name).values) & (recording <= high.sel(case=name).values)
-        columns.append((f"Recording over {_TITLES[name].lower()}", ratio, np.where(usual, _PALE, 1.0)))
+        columns.append((f"Recording over simulation, {'without' if name == 'before' else 'with'} the effects", ratio, np.where(usual, _PALE, 1.0)))
     figure = _maps(surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations")
     bar = figure.axes[-1]
     bar.yaxis.set_major_locator(FixedLocator([0.5, 0.7, 1.0, 1.4, 2.0]))
@@ -227,7 +228,8 @@ def _mark_spans(panel: Axes, axis: str, content: Mapping[str, Any], size: float)
     for box in content["mismatches"]:
         if axis in box["axes"] and box["view"] in ("mean", "restart"):
             begin, end = _time_of(box["start"], start) / size, _time_of(box["end"], start) / size
-            panel.axvspan(begin, end, color="#D00000", alpha=0.12, lw=0)
+            panel.axvspan(begin, end, color="#D00000", alpha=0.05, lw=0)
+            panel.axvspan(begin, end, ymin=0.96, color="#D00000", lw=0)
             panel.annotate(
                 str(box["id"]), (begin, 1.0), (2, -2), xycoords=panel.get_xaxis_transform(), textcoords="offset points",
                 va="top", fontsize=9, color="white", weight="bold", bbox={"facecolor": "#D00000", "edgecolor": "none", "pad": 1.2},

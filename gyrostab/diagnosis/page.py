@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gyrostab.diagnose.result import Diagnosis, check_diagnosis
-from gyrostab.diagnose.sentences import axes_text, chance, length_text, next_measurement, plain_name, summary
+from gyrostab.diagnose.sentences import axes_text, length_text, next_measurement, plain_name, summary
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
 from gyrostab.plot.style import embedded
@@ -32,6 +32,8 @@ _SOURCE = {
     "model": "the model given",
     "simulation": "the simulated log given",
 }
+#: What the file says for programs, for people.
+_REASON = {"below limit": "looked for, not seen"}
 
 
 def write_diagnosis_report(diagnosis: Diagnosis, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
@@ -67,6 +69,7 @@ def write_diagnosis_report(diagnosis: Diagnosis, path: str | os.PathLike[str], *
     with new_output(path, overwrite=overwrite) as temporary:
         text = template.render(
             title="Gyro diagnosis",
+            recording=_recording(content),
             made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
             version=metadata.version("gyrostab"),
             verdict=content["verdict"],
@@ -79,6 +82,7 @@ def write_diagnosis_report(diagnosis: Diagnosis, path: str | os.PathLike[str], *
             limits=_limits(content),
             noise=_noise(content),
             level=f"{100.0 * content['false_alarm_level']:g} %",
+            rare=f"{50.0 * content['false_alarm_level']:g} %",  # the other half of the level is for places
         )
         temporary.write_text(text, encoding="utf-8")
     return Path(path)
@@ -94,6 +98,10 @@ def _stamp(text: str) -> str:
     return text.removesuffix("Z").split(".")[0].replace("T", " ")
 
 
+def _recording(content: Mapping[str, Any]) -> str:
+    return ", ".join(Path(name).name for name in content["recording"]["files"]) or "not recorded"
+
+
 def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     recording, baseline = content["recording"], content["baseline"]
     length = (np.datetime64(recording["end"].removesuffix("Z")) - np.datetime64(recording["start"].removesuffix("Z"))) / np.timedelta64(
@@ -102,7 +110,7 @@ def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     spans = "; ".join(f"{_stamp(first)} to {_stamp(last)}" for first, last in baseline["calibrated_on"][:6])
     more = len(baseline["calibrated_on"]) - 6
     return [
-        ("Recording", ", ".join(Path(name).name for name in recording["files"]) or "not recorded"),
+        ("Recording", _recording(content)),
         ("Span (UTC)", f"{_stamp(recording['start'])} to {_stamp(recording['end'])}, {length_text(float(length))}"),
         ("Axes, sampling rate", f"{', '.join(recording['axes'])} at {recording['sampling_rate_hz']:g} Hz"),
         ("Channels", ", ".join(recording["channels"]) or "none"),
@@ -120,7 +128,6 @@ def _effect(effect: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, 
         "name": effect["name"],
         "driver": effect["driver"] or "",
         "statement": effect["statement"],
-        "when": [f"{_stamp(first)} to {_stamp(last)}" for first, last in effect["intervals"]],
         "rows": [
             {
                 "name": name.replace("_", " "),
@@ -144,8 +151,8 @@ def _mismatch(box: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, A
         "id": box["id"],
         "view": _VIEWS[box["view"]],
         "statement": box["statement"],
-        "chance": chance(box["p_value"]),
-        "explained": ", ".join(box["explained_by"]) or ("not explained" if box["id"] in content["unexplained"] else "–"),
+        "explained": "; ".join(plain_name(name) for name in box["explained_by"])
+        or ("not explained" if box["id"] in content["unexplained"] else "–"),
     }
 
 
@@ -175,7 +182,7 @@ def _limits(content: Mapping[str, Any]) -> list[dict[str, str]]:
     for name, entry in content["not_found"].items():
         unit = "" if entry["unit"] in (None, "1") else f" {entry['unit']}"
         limit = "–" if entry["upper_limit"] is None else f"< {_number(entry['upper_limit'], 2)}{unit}"
-        rows.append({"name": name, "plain": plain_name(name), "limit": limit, "reason": entry["reason"]})
+        rows.append({"name": name, "plain": plain_name(name), "limit": limit, "reason": _REASON.get(entry["reason"], entry["reason"])})
     return sorted(rows, key=lambda row: (row["limit"] == "–", row["name"]))
 
 
@@ -222,9 +229,11 @@ _READ = {
     ),
     "means": (
         "What is constant within a window does not show in the figures above, but here: each dot is the mean rate of a short block. The "
-        "simulation before knows no reason for the mean to move. Red stretches are the numbered mismatches of the mean rate. Beneath: the "
-        "channels."
+        "simulation before knows no reason for the mean to move. Red bars are the numbered mismatches of the mean rate. Beneath: channels."
     ),
-    "deviations": "All windows together. Dots are the recording; where they leave the dashed line, the simulation before is wrong.",
+    "deviations": (
+        "All windows together. Dots are the recording; where they leave the dashed line, the simulation before is wrong. Where both lines "
+        "are one, the named effects change nothing."
+    ),
     "spectra": "Grey is the recording at full resolution, so that narrow lines show; the lines are the simulations, averaged over bands.",
 }

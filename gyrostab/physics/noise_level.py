@@ -80,7 +80,8 @@ class TemperatureNoise(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        terms = [self.quantity(name, errors) for name in self.size_parameters if name == "linear" or getattr(self, name)]
+        names = [name for name in self.size_parameters if getattr(self, name)] or ["linear"]
+        terms = [self.quantity(name, errors) for name in names]
         change = f"changes by {', '.join(terms)} of itself around {self.quantity('reference')}"
         return f"The angle random walk follows the temperature {self.on_axes()}: N^2 {change}."
 

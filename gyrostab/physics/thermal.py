@@ -65,7 +65,8 @@ class TemperatureBias(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        terms = [self.quantity(name, errors) for name in self.size_parameters if name == "sensitivity" or getattr(self, name)]
+        names = [name for name in self.size_parameters if getattr(self, name)] or ["sensitivity"]
+        terms = [self.quantity(name, errors) for name in names]
         return f"The bias follows the temperature {self.on_axes()}, by {', '.join(terms)} around {self.quantity('reference')}."
 
 
@@ -160,8 +161,9 @@ class Shupe(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        more = f" and {self.quantity('transient', errors)} while heat goes through the winding" if self.transient else ""
-        size = f"{self.quantity('sensitivity', errors)}{more} with a lag of {self.quantity('lag', errors)}"
+        terms = [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
+        terms += [f"{self.quantity('transient', errors)} while heat goes through the winding"] if self.transient else []
+        size = f"{' and '.join(terms)} with a lag of {self.quantity('lag', errors)}"
         return f"The bias follows the change of the temperature {self.on_axes()}, by {size}."
 
 

@@ -131,9 +131,13 @@ class VibrationRectification(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        more = f", and of {self.quantity('quartic', errors)} times its fourth power" if self.quartic else ""
-        size = self.quantity("sensitivity", errors)
-        return f"Vibration is rectified to a bias {self.on_axes()}, of {size} times the square of the rms vibration{more}."
+        terms = []
+        if self.sensitivity or not self.quartic:
+            terms.append(f"{self.quantity('sensitivity', errors)} times the square of the rms vibration")
+        if self.quartic:
+            power = "its fourth power" if terms else "the fourth power of the rms vibration"
+            terms.append(f"{self.quantity('quartic', errors)} times {power}")
+        return f"Vibration is rectified to a bias {self.on_axes()}, of {', and of '.join(terms)}."
 
 
 @dataclass(frozen=True, kw_only=True)
