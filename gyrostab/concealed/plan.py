@@ -27,6 +27,7 @@ _APART = (
     {"rate_quantization", "dead_zone"},
     {"rate_quantization", "clipping"},
     {"rate_quantization", "spikes"},
+    {"rate_quantization", "held_samples"},
     {"clipping", "spikes"},
     {"gauss_markov", "telegraph"},
 )

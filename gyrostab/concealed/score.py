@@ -14,6 +14,9 @@ __all__ = ["intersection_over_union", "score_case"]
 
 Intervals = Sequence[Sequence[str]]
 
+#: Numbers of which only the size can be known: the sign of what several axes share is a matter of convention.
+_UNSIGNED = ("N",)
+
 
 def _seconds(intervals: Intervals) -> list[tuple[float, float]]:
     spans = sorted(
@@ -43,24 +46,58 @@ def intersection_over_union(found: Intervals, true: Intervals) -> float:
 
 
 def _names(claim: Mapping[str, Any]) -> set[str]:
-    return {claim["name"], *claim.get("alternatives", ())}
+    return {claim["name"], *claim["alternatives"]}
 
 
-def _gain(claim: Mapping[str, Any]) -> float:
-    return float((claim.get("held_out_gain") or {}).get("nats") or 0.0)
+def _gain(table: Mapping[str, Any]) -> float:
+    return float((table.get("held_out_gain") or {}).get("nats") or 0.0)
 
 
-def _covered(claim: Mapping[str, Any], effect: Mapping[str, Any]) -> list[bool]:
-    """Whether the interval of every parameter that both know, in the same unit and on the same axes, holds the true value."""
+def _claims(diagnosis: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Every name that is claimed once, the strongest first, with all its tables: one for every axis, or every line."""
+    out: dict[str, dict[str, Any]] = {}
+    for table in sorted(diagnosis["effects"], key=_gain, reverse=True):
+        one = out.setdefault(table["name"], {"name": table["name"], "alternatives": set(), "intervals": [], "tables": []})
+        one["alternatives"] |= set(table.get("alternatives", ()))
+        one["intervals"] += table.get("intervals", ())
+        one["tables"].append(table)
+    return list(out.values())
+
+
+def _numbers(claim: Mapping[str, Any], effect: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Every number that truth and claim both have: ``parameter``, ``held`` (is the truth in the 95 % interval?) and ``pull`` (z)."""
     out = []
     for name, true in effect["parameters"].items():
-        found = claim.get("parameters", {}).get(name)
-        if found is None or found.get("unit") != true["unit"] or found.get("low") is None or found.get("high") is None:
-            continue
-        if true.get("axis") is not None and list(claim.get("axes", ())) != [true["axis"]]:
-            continue
-        out.append(bool(found["low"] <= true["value"] <= found["high"]))
+        wanted = true.get("values") or {None: true["value"]}
+        for axis, value in wanted.items():
+            known = [_entry(table, name, axis, unless=true.get("unless", ())) for table in claim["tables"]]
+            near = [(_far(table, effect), entry) for table, entry in zip(claim["tables"], known, strict=True) if entry is not None]
+            if not near:
+                continue
+            found = min(near, key=lambda item: item[0])[1]
+            if found.get("unit") != true["unit"] or found.get("low") is None or found.get("high") is None:
+                continue
+            turned = -1.0 if name in _UNSIGNED and (found["value"] or 0.0) < 0 else 1.0
+            low, high = sorted((turned * found["low"], turned * found["high"]))
+            sure = found.get("value") is not None and found.get("stderr")
+            pull = (turned * found["value"] - value) / found["stderr"] if sure else None
+            out.append({"parameter": name, "held": bool(low <= value <= high), "pull": pull})
     return out
+
+
+def _entry(table: Mapping[str, Any], name: str, axis: str | None, *, unless: Sequence[str]) -> Mapping[str, Any] | None:
+    """The number of this name in a claim's table, for an axis or for all; none where others are beside it that change its meaning."""
+    parameters, axes = table.get("parameters", {}), list(table.get("axes", ()))
+    if {key.split(".")[0] for key in parameters} & set(unless) or (axis is not None and axis not in axes):
+        return None
+    found: Mapping[str, Any] | None = parameters.get(f"{name}.{axis}" if axis is not None and len(axes) > 1 else name)
+    return found
+
+
+def _far(table: Mapping[str, Any], effect: Mapping[str, Any]) -> float:
+    """How far a claim's table is from an effect that has a frequency: of several lines the nearest is meant."""
+    true, found = effect["parameters"].get("frequency"), table.get("parameters", {}).get("frequency")
+    return abs(found["value"] - true["value"]) if true and found and found.get("value") is not None else 0.0
 
 
 def _tau_hit(diagnosis: Mapping[str, Any], name: str, effect: Mapping[str, Any]) -> bool | None:
@@ -93,8 +130,9 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
     -------
     list of dict
         A row for every true effect, or one row where there is none: ``kind``, ``effect``, ``strength``, ``detected``, ``named`` (classes
-        merged by the ambiguity sets), ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (claims that stand for nothing true),
-        ``unknown``, ``iou``, ``tau_hit``, ``covered``, ``gain``, ``oracle``, ``seconds``, ``claims`` and more.
+        merged by the ambiguity sets), ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (names that stand for nothing true),
+        ``unknown``, ``iou``, ``tau_hit``, ``numbers``, ``gain``, ``oracle``, ``seconds``, ``claims`` and more. A name is counted once,
+        on however many axes it is claimed.
 
     Raises
     ------
@@ -103,7 +141,7 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
     """
     _check(diagnosis)
     accepted = set(truth["accepted"])
-    claims = sorted(diagnosis["effects"], key=_gain, reverse=True)
+    claims = _claims(diagnosis)
     true = [effect["name"] for effect in truth["effects"]]
     standing = accepted.union(*(merged(name) for name in true)) if true else accepted
     wrong = [claim["name"] for claim in claims if not _names(claim) & standing]
@@ -112,6 +150,8 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
     case = {
         "index": plan.get("index"),
         "kind": plan.get("kind"),
+        "recording": plan.get("recording"),
+        "copy": plan.get("copy"),
         "severing": plan.get("severing"),
         "rate": truth["sampling_rate_hz"],
         "length": truth["seconds"],
@@ -140,6 +180,7 @@ def _row(
     others = accepted.union(*(merged(other) for other in true if other != name)) - merged(name)
     mine = [claim for claim in claims if claim["name"] not in others]
     top = mine[0] if mine else None
+    own = next((claim for claim in mine if claim["name"] in merged(name)), None)
     row: dict[str, Any] = {
         "effect": name,
         "strength": effect["strength"],
@@ -151,14 +192,14 @@ def _row(
         "set_size": None,
         "iou": None,
         "tau_hit": None,
-        "covered": [],
+        "numbers": [],
     }
     if top is not None:
         row["in_set"] = name in _names(top)
         row["set_size"] = len(_names(top))
-    if top is not None and row["named"]:
-        row["covered"] = _covered(top, effect)
-        row["tau_hit"] = _tau_hit(diagnosis, top["name"], effect)
-        if effect["localised"] and top.get("intervals"):
-            row["iou"] = intersection_over_union(top["intervals"], effect["intervals"])
+    if own is not None:
+        row["numbers"] = _numbers(own, effect) if own["name"] == name else []
+        row["tau_hit"] = _tau_hit(diagnosis, own["name"], effect)
+        if effect["localised"] and own["intervals"]:
+            row["iou"] = intersection_over_union(own["intervals"], effect["intervals"])
     return row

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from gyrostab.errors import ResumeError
 from gyrostab.prove.folder import TUNING, begin, case_name, look, read_sums, write_sums
 from gyrostab.prove.pool import each_in_processes
 from gyrostab.prove.steps import compare_case, diagnose_case, draw_case
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["Proof", "prove"]
 
 _USUAL = {"cases": 40, "nulls": 400}
+
+_SALTED = 20  # drawn cases to a salted real recording, which makes four more
 
 
 class Proof(NamedTuple):
@@ -47,6 +50,7 @@ def prove(
     seed: int | None = None,
     nulls: int | None = None,
     workers: int | None = None,
+    real: str | os.PathLike[str] | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: Stage | None = None,
@@ -69,6 +73,8 @@ def prove(
         Null records of each diagnosis, 400 by default.
     workers : int
         Processes; as many as there are cores by default, 0 for none but this one.
+    real : path-like
+        Folder of real recordings to be salted, one for every 20 cases; none are without it. See `gyrostab.concealed.real`.
     resume : bool
         Go on with what was begun in the folder; begin where nothing was.
     overwrite : bool
@@ -89,7 +95,7 @@ def prove(
     ResumeError
         When other cases were begun in it, or another process works on it.
     FormatError
-        When a truth is not the one that was sealed.
+        When a truth is not the one that was sealed, or a real recording cannot be read.
     WorkerError
         When a process dies.
 
@@ -102,7 +108,8 @@ def prove(
     from gyrostab.run.job import hold
 
     folder, stage, tell = Path(directory), progress or no_stage, say or (lambda text: None)
-    fresh = {**_USUAL, "seed": TUNING + secrets.randbelow(10**9)}
+    salted = 0 if real is None else (cases or _USUAL["cases"]) // _SALTED
+    fresh = {**_USUAL, "seed": TUNING + secrets.randbelow(10**9), "salted": salted}
     wanted = {"cases": cases, "seed": seed, "nulls": nulls}
     look(folder, wanted, fresh, resume=resume, overwrite=overwrite)
     with hold(folder):
@@ -110,16 +117,29 @@ def prove(
         tell(_opening(job, folder))
         number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         number = number if workers is None else workers
-        names = [case_name(job["seed"], index) for index in range(job["cases"])]
-        sums, sealed = _drawn(folder, job, names, number, stage)
+        plans = _plans(job)
+        names = list(plans)
+        sums, sealed = _drawn(folder, plans, number, stage, None if real is None else Path(real))
         tell(f"sealed: {len(names)} truths, SHA-256 of their list {sealed}")
         failed = _diagnosed(folder, job, names, number, stage)
         return _opened(folder, job, names, sums, sealed, failed, number, stage)
 
 
+def _plans(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Name of each case, drawn or salted, to its plan."""
+    from gyrostab.concealed import plan_cases, plan_salted
+
+    drawn = {case_name(job["seed"], plan["index"]): plan for plan in plan_cases(job["cases"], seed=job["seed"])}
+    return drawn | {case_name(job["seed"], plan["index"], plan["copy"]): plan for plan in plan_salted(job["salted"], seed=job["seed"])}
+
+
 def _opening(job: dict[str, Any], folder: Path) -> str:
     said = f"{job['cases']} cases of seed {job['seed']}; the same again: gyrostab prove --cases {job['cases']} --seed {job['seed']}"
     said += f" --nulls {job['nulls']}" if job["nulls"] != _USUAL["nulls"] else ""
+    if job["salted"]:
+        said += f"\nand {job['salted']} real recordings, each with salt and three times without"
+    else:
+        said += "\nno real recordings are salted: their folder is not known"
     done = len(list((folder / "diagnoses").glob("*.json")))
     return said + (f"\n{done} of them are diagnosed already" if done else "")
 
@@ -129,17 +149,16 @@ def _counter(stage: Stage, label: str, total: int, first: int = 0) -> Callable[[
     return lambda done: stage(label, total, first + done, "cases")
 
 
-def _drawn(folder: Path, job: dict[str, Any], names: list[str], workers: int, stage: Stage) -> tuple[dict[str, str], str]:
+def _drawn(folder: Path, plans: dict[str, dict[str, Any]], workers: int, stage: Stage, real: Path | None) -> tuple[dict[str, str], str]:
     """Draw what is not drawn, and seal; what was sealed once is never drawn again."""
-    from gyrostab.concealed import plan_cases
-
     kept = read_sums(folder)
     if kept is not None:
         return kept
-    plans = plan_cases(job["cases"], seed=job["seed"])
-    jobs = [(folder, name, plan) for name, plan in zip(names, plans, strict=True)]
+    if real is None and any("copy" in plan for plan in plans.values()):
+        raise ResumeError(f"{folder}: was begun with real recordings, which are not drawn yet; say again where they are")
+    jobs = [(folder, name, plan, real) for name, plan in plans.items()]
     found = each_in_processes(draw_case, jobs, workers=workers, told=_counter(stage, "drawing", len(jobs)))
-    sums = dict(zip(names, found, strict=True))
+    sums = dict(zip(plans, found, strict=True))
     return sums, write_sums(folder, sums)
 
 
@@ -171,11 +190,12 @@ def _opened(
     from gyrostab.prove.outcome import score_rows, write_outcome
 
     truths = {name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in names}
-    jobs = [(folder / "recordings" / f"{name}.nc", truths[name], folder / "comparisons" / f"{name}.json") for name in names]
-    naive = each_in_processes(compare_case, jobs, workers=workers, told=_counter(stage, "comparing", len(names)))
+    drawn = [name for name in names if "copy" not in truths[name]["plan"]]  # of real noise no truth says how much it is
+    jobs = [(folder / "recordings" / f"{name}.nc", truths[name], folder / "comparisons" / f"{name}.json") for name in drawn]
+    naive = each_in_processes(compare_case, jobs, workers=workers, told=_counter(stage, "comparing", len(drawn)))
     found = {name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8")) for name in names if name not in failed}
     stage("counting", 0)
-    rows = score_rows(found, truths, dict(zip(names, naive, strict=True)))
+    rows = score_rows(found, truths, dict(zip(drawn, naive, strict=True)))
     table = score_table(rows)
     files = write_outcome(folder, rows, table, job=job, sealed=sealed, failed=failed)
     return Proof(job["seed"], sealed, table, missed(table), failed, files)

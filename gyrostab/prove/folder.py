@@ -23,7 +23,7 @@ __all__ = ["TUNING", "asked", "begin", "case_name", "code_state", "look", "read_
 #: Seeds below this one are for tuning; what is published uses others.
 TUNING = 1_000_000
 
-_SCHEMA = "gyrostab.prove/1"
+_SCHEMA = "gyrostab.prove/2"
 _SUMS = "SHA256SUMS"
 _FOLDERS = ("recordings", "truth", "diagnoses", "comparisons", "failed")
 _FILES = ("benchmark.json", _SUMS, "scores.csv", "table.md", "completeness.png", "reliability.png", "lock")
@@ -41,15 +41,15 @@ def write_json(path: Path, content: Any) -> Path:
     return write_text(path, json.dumps(content, indent=1) + "\n")
 
 
-def case_name(seed: int, index: int) -> str:
-    """Name of the files of a case; who does not know the seed learns nothing from it, not even the order.
+def case_name(seed: int, index: int, copy: str = "") -> str:
+    """Name of the files of a case, or of a copy of a real recording; who does not know the seed learns nothing from it.
 
     Examples
     --------
     >>> case_name(1, 0) == case_name(1, 0), case_name(1, 0) == case_name(1, 1), len(case_name(1, 0))
     (True, False, 12)
     """
-    return hashlib.sha256(f"name of case {index} of seed {seed}".encode()).hexdigest()[:12]
+    return hashlib.sha256(f"name of case {index} of seed {seed}{copy}".encode()).hexdigest()[:12]
 
 
 def code_state() -> str:
@@ -83,7 +83,7 @@ def look(
     _check_place(directory)
     before = asked(directory) if directory.is_dir() and (resume or not overwrite) else None
     if before is None:
-        chosen = {name: usual[name] if value is None else value for name, value in wanted.items()}
+        chosen = dict(usual) | {name: value for name, value in wanted.items() if value is not None}
         _check_wishes(chosen)
         _check_content(directory, overwrite=overwrite)
         return None, chosen
@@ -105,7 +105,7 @@ def begin(directory: Path, wanted: Mapping[str, int | None], usual: Mapping[str,
     wanted : mapping
         ``cases``, ``seed`` and ``nulls``, None where it was not said.
     usual : mapping
-        What stands where nothing was said.
+        What stands where nothing was said; more than is in `wanted` is written down as it is.
     resume, overwrite : bool
         Go on where a run stopped; forget one.
 

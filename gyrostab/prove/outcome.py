@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.concealed import curves, markdown, missed, reliability, score_case
+from gyrostab.concealed import by_effect, curves, markdown, missed, reliability, salt_differences, salt_table, score_case
 from gyrostab.output import new_output
 from gyrostab.prove.figures import draw_completeness, draw_reliability
 from gyrostab.prove.folder import TUNING, write_text
@@ -30,7 +30,7 @@ def score_rows(found: Mapping[str, dict[str, Any]], truths: Mapping[str, dict[st
     return [
         {"name": name, "failed": name not in found, **row}
         for name, truth in truths.items()
-        for row in score_case(found.get(name, _NOTHING), truth, naive=naive[name])
+        for row in score_case(found.get(name, _NOTHING), truth, naive=naive.get(name))
     ]
 
 
@@ -54,25 +54,70 @@ def page_text(
     """The outcome in Markdown: how it was made, the table, the targets missed, the curves, and the cases that went wrong."""
     shown = curves(rows)
     every = shown[shown["effect"] == "all"] if len(shown) else shown
-    each = reliability(rows)
+    drawn = [row for row in rows if row["kind"] not in ("salted", "control")]
     parts = [
         _made(rows, job, sealed),
         "### Figures with 95 % intervals and targets",
+        "A target is *met* where the whole interval lies where it should, *missed* where the value does not, and else *not shown*: there "
+        "are too few cases to tell.",
         markdown(table),
         "### Targets that were missed",
         _listed(missed(table), "none"),
-        "### Completeness against strength, in units of the closed-form limit",
+        "### Completeness against strength",
+        "Shares of all effects of the catalogue whose channel was there; strength in units of the closed-form limit.",
         markdown(every.drop(columns="effect")) if len(every) else "no effects among these cases",
-        "### Claims by name",
-        markdown(each) if len(each) else "nothing was named",
+        "### Effect by effect",
+        "*n*: cases at 1.5 times the limit and more, and the shares of them that were *detected*, *named* (ambiguity sets merged) and "
+        "named *exactly*. *claims*: how often the name was given in all cases, and the share of these that stands for something true "
+        "(*right*). *numbers*: parameters that can be compared, and the share whose 95 % interval holds the truth (*held*).",
+        markdown(by_effect(rows)),
         "### Wrong names",
-        _listed([_wrong(row) for row in _cases(rows) if row["wrong"]], "none"),
+        _listed([_wrong(row) for row in _cases(drawn) if row["wrong"]], "none"),
         "### Clear effects that were missed",
-        _listed([_silent(row) for row in rows if row["effect"] and row["strength"] >= 1.5 and not row["detected"]], "none"),
+        _listed([_silent(row) for row in drawn if row["effect"] and row["strength"] >= 1.5 and not row["detected"]], "none"),
+        "### Real recordings with salt",
+        *_salted(rows),
+        "### What it cost",
+        markdown(_cost(drawn)),
         "### Diagnoses that failed",
         _listed([f"{name}: {why}" for name, why in failed.items()], "none"),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _salted(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    found = salt_differences(rows)
+    if not found:
+        return ["None: the folder of the real recordings was not given to this run."]
+    lines = [
+        f"{one['recording']}, {one['effect']} at {one['strength']:g}: "
+        + ("named" if one["named"] else "not named")
+        + (", and so it was without salt" if one["there_before"] else "")
+        + "".join(f"; {label} {', '.join(one[key])}" for key, label in _TURNED.items() if one[key])
+        for one in found
+    ]
+    about = (
+        "An effect is added to a piece of a real recording, which holds effects of its own; so what counts is what is claimed beside that "
+        "which is claimed of the untouched piece, by the salted one and by copies of the untouched one turned in sign and in time."
+    )
+    return [about, markdown(salt_table(rows)), _listed(lines, "none")]
+
+
+_TURNED = {
+    "before": "without salt",
+    "others": "salt brings",
+    "flipped": "turned in sign",
+    "reversed": "turned in time",
+}
+
+
+def _cost(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Seconds that a diagnosis took, by rate and length."""
+    each = pd.DataFrame([{key: row[key] for key in ("rate", "length", "seconds")} for row in _cases(rows)])
+    each["length"] = pd.cut(each["length"], [0, 1200, 3600, 10800, math.inf], labels=["< 20 min", "< 1 h", "< 3 h", "longer"], right=False)
+    parts = each.groupby(["rate", "length"], observed=True)["seconds"]
+    table = parts.agg(["count", "median", "max", "sum"]).reset_index()
+    return table.rename(columns={"rate": "rate [Hz]", "median": "median [s]", "max": "longest [s]", "sum": "all [s]"})
 
 
 def _made(rows: Sequence[Mapping[str, Any]], job: Mapping[str, Any], sealed: str) -> str:

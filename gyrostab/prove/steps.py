@@ -15,9 +15,9 @@ from gyrostab.prove.folder import write_json, write_text
 __all__ = ["compare_case", "diagnose_case", "draw_case"]
 
 
-def draw_case(directory: Path, name: str, plan: dict[str, Any]) -> str:
-    """Write the recording and the truth of a plan unless both are there; the SHA-256 of the truth."""
-    from gyrostab.concealed import make_case, seal
+def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | None = None) -> str:
+    """Write the recording and the truth of a plan unless both are there; the SHA-256 of the truth. `real` holds what is salted."""
+    from gyrostab.concealed import make_case, make_salted, seal
     from gyrostab.concealed.seal import fingerprint
 
     truth = directory / "truth" / f"{name}.json"
@@ -27,7 +27,7 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any]) -> str:
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
-        log, told = make_case(plan)
+        log, told = make_salted(plan, real) if real is not None and "copy" in plan else make_case(plan)
         sha256 = seal(log, told, part, name=name)
         os.replace(part / "recordings" / f"{name}.nc", directory / "recordings" / f"{name}.nc")
         os.replace(part / "truth" / f"{name}.json", truth)

@@ -27,6 +27,7 @@ def prove(
     cases: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=1))] = None,
     seed: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=0))] = None,
     nulls: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=100))] = None,
+    real: Annotated[Path | None, Parameter(metavar="DIR", env_var="GYROSTAB_RECORDINGS")] = None,
     resume: Flag = False,
     common: Common = Common(),
 ) -> None:
@@ -47,6 +48,8 @@ def prove(
         Of the draws (default: a fresh one, which is printed). Seeds below 1000000 are for tuning; figures that are published use others.
     nulls
         Null records of each diagnosis (default: 400; 200 for a quick look).
+    real
+        Folder of real recordings (default: $GYROSTAB_RECORDINGS); one is salted for every 20 cases. Without it none is.
     resume
         Continue a run that was stopped or killed; begin one where there is none.
     """
@@ -67,6 +70,7 @@ def prove(
                 seed=seed,
                 nulls=nulls,
                 workers=common.workers,
+                real=real,
                 resume=resume,
                 overwrite=common.overwrite,
                 progress=told,

@@ -1,0 +1,95 @@
+"""A figure with its 95 % interval beside its target: met only where the interval says so, and not shown where it is too wide."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["NO_TARGET", "Target", "median", "share", "spread", "wilson"]
+
+Line = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where a figure should lie, and where its interval has to for the target to be met; `text` says it.
+
+    Without a `surely` of its own the interval has to lie where the figure should.
+    """
+
+    text: str
+    least: float = -math.inf
+    most: float = math.inf
+    surely: float | None = None
+
+    def state(self, value: float, low: float, high: float) -> str:
+        """Met, missed, or not shown by so few cases.
+
+        Examples
+        --------
+        >>> Target(">= 95 %", least=0.95).state(0.97, 0.92, 0.99)
+        'not shown'
+        """
+        if not self.text:
+            return ""
+        if not math.isfinite(value):
+            return "not shown"
+        if not self.least <= value <= self.most:
+            return "missed"
+        return "met" if low >= self.least and high <= (self.most if self.surely is None else self.surely) else "not shown"
+
+
+NO_TARGET = Target("")
+
+
+def wilson(hits: int, total: int, *, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share.
+
+    Examples
+    --------
+    >>> [round(limit, 4) for limit in wilson(0, 300)]
+    [0.0, 0.0126]
+    """
+    if total == 0:
+        return 0.0, 1.0
+    part, spread = hits / total, z**2 / total
+    middle = (part + spread / 2) / (1 + spread)
+    half = z * math.sqrt(part * (1 - part) / total + spread / (4 * total)) / (1 + spread)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def _line(name: str, value: float, low: float, high: float, number: int, target: Target) -> Line:
+    state = target.state(value, low, high)
+    return {"quantity": name, "value": value, "low": low, "high": high, "n": number, "target": target.text, "state": state}
+
+
+def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
+    """A share of cases, with Wilson's interval."""
+    found = [bool(flag) for flag in flags]
+    hits, total = sum(found), len(found)
+    return _line(name, hits / total if total else math.nan, *(wilson(hits, total) if total else (math.nan, math.nan)), total, target)
+
+
+def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET) -> Line:
+    """A median, with its interval by the order of the values."""
+    found = np.sort([value for value in values if value is not None and math.isfinite(value)])
+    if found.size == 0:
+        return _line(name, math.nan, math.nan, math.nan, 0, target)
+    reach = 0.98 * math.sqrt(found.size)
+    low, high = math.floor((found.size - 1) / 2 - reach), math.ceil((found.size - 1) / 2 + reach)
+    ends = (-math.inf, math.inf) if found.size < 6 else (found[max(0, low)], found[min(found.size - 1, high)])
+    return _line(name, float(np.median(found)), float(ends[0]), float(ends[1]), found.size, target)
+
+
+def spread(name: str, pulls: Iterable[float | None], target: Target = NO_TARGET) -> Line:
+    """How far two thirds of errors go, in units of what was said of them: 1 where that was right; few large ones do not count."""
+    found = np.abs([pull for pull in pulls if pull is not None and math.isfinite(pull)])
+    if found.size == 0:
+        return _line(name, math.nan, math.nan, math.nan, 0, target)
+    value, off = float(np.quantile(found, 0.6827)), 0.96 / math.sqrt(found.size)  # of the share, by the binomial law
+    low, high = (float(np.quantile(found, min(max(0.6827 + step, 0.0), 1.0))) for step in (-off, off))
+    return _line(name, value, low, high, found.size, target)
