@@ -10,10 +10,11 @@ from threadpoolctl import threadpool_limits
 
 from gyrostab.diagnose.explained import explain_away
 from gyrostab.diagnose.folds import FOLDS, fold_blocks, fold_subsets
+from gyrostab.diagnose.lines import line_gains
 from gyrostab.diagnose.name import Claim, name_effects, tail_level
 from gyrostab.diagnose.search import together
 from gyrostab.diagnose.surrogates import beats_slides
-from gyrostab.diagnose.tallies import count_gains, expected_counts, line_gains
+from gyrostab.diagnose.tallies import count_gains, expected_counts
 from gyrostab.errors import OptionError
 from tests.named import WORLD, nulls, record
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import xarray as xr
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.cells import State
 from gyrostab.diagnose.designs import Candidate
 from gyrostab.diagnose.explained import Part
+from gyrostab.diagnose.parts import axes_of, gain_sum
 from gyrostab.diagnose.search import Tallies
 
-__all__ = ["Claim", "Naming", "Unknown"]
+__all__ = ["Claim", "Naming", "Unknown", "form_error", "unknown_of", "with_claim"]
 
 Array = NDArray[np.float64]
 
@@ -116,3 +118,38 @@ class Naming:
         if not self.claims:
             return "unknown" if self.unknown else "no mismatch"
         return "partly explained" if self.unknown else "explained"
+
+
+def with_claim(chosen: Sequence[Claim | Unknown], one: Claim | Unknown) -> list[Claim | Unknown]:
+    """The list with another claim; one of the same effect and channel becomes one with it, but for lines of other frequencies."""
+    for place, other in enumerate(chosen):
+        if isinstance(one, Claim) and isinstance(other, Claim) and _same(one, other):
+            axes = tuple(sorted({*other.axes, *one.axes}))
+            alike = tuple(dict.fromkeys([*other.alternatives, *one.alternatives]))
+            both = replace(other, axes=axes, parts=(*other.parts, *one.parts), gain=other.gain + one.gain, alternatives=alike)
+            return [*chosen[:place], both, *chosen[place + 1 :]]
+    return [*chosen, one]
+
+
+def _same(one: Claim, other: Claim) -> bool:
+    lines = {part.place for claim in (one, other) for part in claim.parts if part.candidate.view == "line"}
+    return (one.effect, one.driver) == (other.effect, other.driver) and len(lines) < 2
+
+
+def unknown_of(key: str, parts: Sequence[Part], threshold: float, near: Sequence[str]) -> Unknown:
+    """What a generic found; `near` are the effects that come nearest."""
+    return Unknown(key, axes_of(parts, ()), gain_sum(parts), threshold, tuple(dict.fromkeys(near)), tuple(parts))
+
+
+def form_error(parts: Sequence[Part], chosen: Sequence[Claim | Unknown], *, share: float) -> float:
+    """What errors of the form of what is named already may leave in the views and axes of these parts [nats].
+
+    A steady line leaves nothing at other frequencies: what it leaks into is taken out with it.
+    """
+    views = [(part.candidate.view, set(part.row)) for part in parts if part.candidate.view != "line"]
+    return sum(
+        share * part.gain
+        for one in chosen
+        for part in one.parts
+        if any(part.candidate.view == view and axes & set(part.row) for view, axes in views)
+    )

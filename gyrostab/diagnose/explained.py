@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, harmonic_sets, order_columns, pair_rows, power_column
 from gyrostab.diagnose.gain import noise_columns
+from gyrostab.diagnose.lines import line_skirt
 from gyrostab.physics.phase import fold
 
 __all__ = ["Part", "explain_away", "mean_columns", "reweighted", "take_part", "without_turns"]
@@ -203,8 +204,7 @@ def _line(state: State, part: Part) -> State:
         column[:, band] = 1.0
         state = state.with_columns("power", axis, [column])
         state = _coherent(state, (axis,), column)
-    near = np.abs(np.arange(state.reduced.sizes["line"]) - part.place) <= _LINE_REACH
-    return state.with_columns("line", "all", [near])
+    return state.with_columns("line", "all", [line_skirt(state.reduced, axis, part.place)])
 
 
 def _marks(state: State, part: Part) -> State:

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.candidates import Candidate, effect_candidates
 from gyrostab.diagnose.cells import State, begin_state
-from gyrostab.diagnose.claims import Claim, Naming, Unknown
-from gyrostab.diagnose.explained import Part, explain_away, mean_columns
+from gyrostab.diagnose.claims import Claim, Naming, Unknown, form_error, unknown_of, with_claim
+from gyrostab.diagnose.complete import flexible, redness, unrest
+from gyrostab.diagnose.explained import Part, explain_away
 from gyrostab.diagnose.folds import fold_blocks
-from gyrostab.diagnose.gain import mean_factors
 from gyrostab.diagnose.generics import generic_candidates
-from gyrostab.diagnose.search import Found, Tallies, gains, together, totals
-from gyrostab.diagnose.sizes import mean_mixture
+from gyrostab.diagnose.lattice import rounded_rates
+from gyrostab.diagnose.parts import PLAIN_LINE, axes_of, by_key, gain_of, gain_sum, parts_of, tried_again, without_lines
+from gyrostab.diagnose.search import Found, Tallies, gains, totals
 from gyrostab.diagnose.structure import allowed, structural
 from gyrostab.diagnose.surrogates import beats_slides
 from gyrostab.diagnose.tallies import Expected
 from gyrostab.errors import OptionError
-from gyrostab.noise import HOUR
 from gyrostab.progress import Stage, no_stage
 
 __all__ = ["Claim", "Naming", "Unknown", "name_effects", "tail_level"]
@@ -33,11 +33,12 @@ Array = NDArray[np.float64]
 AMBIGUOUS = 3.0
 #: Of the gain of what is named, what an error of its form may leave: 10 % of its size.
 FORM = 0.01
-_ROW = 2.0  # nats that an axis must bring to be named with the others
 _ROUNDS = 10
 _LEAST_NULLS = 40
+_LEFT = 2.0  # nats that may be left, beside errors of the form
 _SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
-_LOCKED = ("order", "phase_locked", "transfer")
+_LOCKED = ("order", "phase_locked")
+_WEIGHED = ("power", "cross", "order", "phase_locked", "transfer")  # views whose weights are the expected powers
 _TAIL = 0.25
 
 
@@ -81,6 +82,8 @@ def name_effects(
     candidates = [*known, *generic_candidates(reduced)]
     state = begin_state(reduced, baseline)
     best, tallies = _null_best(candidates, nulls, state, folds, np.random.default_rng(seed), progress)
+    if not tallies.rounded.any() and (reduced["lattice"] > 0.0).any():
+        reasons |= {"rate_quantization": "not identifiable: the lattice of values is that of angles, or too fine to show"}
     search = _Search(candidates, folds, tallies, tail_level(best, level))
     claims, unknown, state = search.run(state)
     return Naming(tuple(claims), tuple(unknown), search.threshold, best, reasons, tuple(candidates), state, folds, tallies)
@@ -109,7 +112,7 @@ def _null_best(
         progress("naming", 0, records)
     if records < _LEAST_NULLS:
         raise OptionError(f"{records} null records are too few to tell how often noise alone does as much; give nulls=400")
-    tallies = Tallies.gathered(expected)
+    tallies = Tallies.gathered(expected, rounded_rates(state.reduced, state.baseline))
     best = []
     for total, chunk in zip(sums, kept, strict=True):
         counted = totals(gains(marks, chunk, state, folds, tallies=tallies))
@@ -156,15 +159,16 @@ class _Search:
             one, rejected = pick
             barred |= rejected
             if one is not None:
-                chosen = _merged(chosen, one)
+                chosen = with_claim(chosen, one)
                 barred |= self._counted(one)
                 state = explain_away(state, list(one.parts))
         chosen = self._pruned(start, chosen)
         claims = [self._finished(start, one, chosen) for one in chosen if isinstance(one, Claim)]
         unknown = [one for one in chosen if isinstance(one, Unknown)]
         state = self._with(start, [*claims, *unknown])
-        claims, withdrawn = self._complete(state, claims, unknown)
-        return sorted(claims, key=lambda one: -one.gain), [*unknown, *withdrawn], state
+        claims, withdrawn = self._complete(start, state, claims, unknown)
+        unknown += withdrawn
+        return sorted(claims, key=lambda one: -one.gain), unknown, self._with(start, [*claims, *unknown]) if withdrawn else state
 
     def _counted(self, one: Claim | Unknown) -> set[str]:
         """Keys that stand for counts which are explained now: there is nothing to take out of a count."""
@@ -179,33 +183,34 @@ class _Search:
         return gains(self.candidates, state.reduced, state, self.folds, tallies=self.tallies)
 
     def _ranked(self, state: State, barred: set[str]) -> list[Found]:
-        """Gains of all that is not barred, with weights that suit the best in the powers."""
+        """Gains of all that is not barred, with weights that suit the best in the powers: what is loud is loud in every view."""
         found = [one for one in self._gains(state) if one.candidate.key not in barred]
+        weighed = [one.candidate for one in found if one.candidate.view in _WEIGHED]
         for _ in range(2):
             powers = [one for one in found if one.candidate.view == "power"]
             strong = max(powers, key=lambda one: float(np.maximum(one.gain[0], 0.0).sum()), default=None)
             if strong is None or np.maximum(strong.gain[0], 0.0).sum() < 3.0 * self.threshold:
                 break
-            trial = explain_away(state, _parts(strong))
-            again = gains([one.candidate for one in powers], state.reduced, replace(state, weight=trial.weight), self.folds)
-            found = [one for one in found if one.candidate.view != "power"] + again
+            trial = explain_away(state, parts_of(strong))
+            again = gains(weighed, state.reduced, replace(state, weight=trial.weight), self.folds)
+            found = [one for one in found if one.candidate.view not in _WEIGHED] + again
         return found
 
     def _pick(self, found: list[Found], state: State, chosen: Sequence[Claim | Unknown]) -> tuple[Claim | Unknown | None, set[str]] | None:
         """The next effect, or generic; None when nothing passes. Second: keys that are out of the race from now on."""
-        parts = _by_key(found)
-        need = {key: self.threshold + _form_error(several, chosen) for key, several in parts.items()}
-        ranked = sorted(parts, key=lambda key: -_sum(parts[key]))
-        passing = [key for key in ranked if _sum(parts[key]) > need[key]]
+        parts = without_lines(by_key(found))
+        need = {key: self.threshold + form_error(several, chosen, share=FORM) for key, several in parts.items()}
+        ranked = sorted(parts, key=lambda key: -gain_sum(parts[key]))
+        passing = [key for key in ranked if gain_sum(parts[key]) > need[key]]
         odd = [key for key in passing if parts[key][0].candidate.view == "marks" and not key.startswith("~")]
-        passing = odd or passing  # odd samples first: they raise powers and means too, and not the other way round
-        if any(parts[key][0].candidate.view in _LOCKED for key in passing):
-            passing = [key for key in passing if parts[key][0].candidate.view != "line"]  # what is locked to a channel makes lines
+        shared = [key for key in passing if gain_sum(_witnessed(parts[key], state)) > need[key]]
+        # odd samples first: they raise powers and means too, and not the other way round; then motion that another sensor sees as well
+        passing = odd or shared or self._without_locked_lines(passing, parts, state)
         if not passing:
             return None
-        top = _sum(parts[passing[0]])
-        rivals = [key for key in passing if not key.startswith("~") and _sum(parts[key]) >= top - AMBIGUOUS - FORM * top]
-        rivals.sort(key=lambda key: -_sum(parts[key]) + AMBIGUOUS * self._lonely(parts[key]))
+        top = gain_sum(parts[passing[0]])
+        rivals = [key for key in passing if not key.startswith("~") and gain_sum(parts[key]) >= top - AMBIGUOUS - FORM * top]
+        rivals.sort(key=lambda key: -gain_sum(parts[key]) + AMBIGUOUS * self._lonely(parts[key]))
         rejected: set[str] = set()
         for key in rivals:
             effect = parts[key][0].candidate.effect
@@ -216,14 +221,23 @@ class _Search:
             if not passed:
                 rejected.add(key)
                 continue
-            close = [one for one in rivals if one != key and one not in rejected and _sum(parts[one]) >= _sum(parts[key]) - AMBIGUOUS]
+            close = [
+                one for one in rivals if one != key and one not in rejected and gain_sum(parts[one]) >= gain_sum(parts[key]) - AMBIGUOUS
+            ]
             names = [parts[one][0].candidate.effect for one in close if allowed(parts[one][0].candidate.effect, parts[one], state)]
             return self._claim(parts[key], need[key], names, p_value), rejected
         if rejected:
             return None, rejected
         generic = passing[0]
         near = [parts[one][0].candidate.effect for one in passing if not one.startswith("~")][:3]
-        return _unknown(generic, parts[generic], need[generic], near), set()
+        return unknown_of(generic, parts[generic], need[generic], near), set()
+
+    def _without_locked_lines(self, passing: list[str], parts: dict[str, list[Part]], state: State) -> list[str]:
+        """Keys without a line that is locked to a channel: what is locked makes lines, at frequencies of its own."""
+        locked = [key for key in passing if parts[key][0].candidate.view in _LOCKED]
+        lines = [key for key in passing if parts[key][0].candidate.view == "line"]
+        taken = [mask for key in locked if lines for mask in explain_away(state, parts[key]).given.get(("line", "all"), [])]
+        return [key for key in passing if key not in lines or not any(mask[parts[key][0].place] for mask in taken)]
 
     def _lonely(self, parts: Sequence[Part]) -> bool:
         """An effect that should be one process on all axes, and shows on a single one."""
@@ -233,9 +247,9 @@ class _Search:
 
     def _claim(self, parts: list[Part], threshold: float, names: Sequence[str], p_value: float) -> Claim:
         first = parts[0].candidate
-        axes = _axes(parts, list(map(str, self.folds.attrs.get("axes", ()))))
+        axes = axes_of(parts, list(map(str, self.folds.attrs.get("axes", ()))))
         others = tuple(dict.fromkeys(name for name in names if name != first.effect))
-        return Claim(first.effect, first.driver, axes, tuple(parts), _sum(parts), threshold, others, p_value)
+        return Claim(first.effect, first.driver, axes, tuple(parts), gain_sum(parts), threshold, others, p_value)
 
     def _with(self, start: State, chosen: Sequence[Claim | Unknown], without: Claim | Unknown | None = None) -> State:
         state = start
@@ -246,12 +260,12 @@ class _Search:
 
     def _pruned(self, start: State, chosen: list[Claim | Unknown]) -> list[Claim | Unknown]:
         """Without what no longer passes when the others are in, the weakest first."""
-        for one in sorted(chosen, key=lambda one: one.gain):
-            if len(chosen) < 2 or one is chosen[0]:
+        for one in sorted(chosen, key=lambda one: (isinstance(one, Claim), one.gain)):  # what has no name the first
+            if len(chosen) < 2 or (one is chosen[0] and isinstance(one, Claim)):
                 continue
             state = self._with(start, chosen, one)
-            again = _by_key(gains(_only(one.parts), state.reduced, state, self.folds, tallies=self.tallies))
-            if max((_sum(parts) for parts in again.values()), default=0.0) < self.threshold:
+            again = by_key(gains(tried_again(one.parts), state.reduced, state, self.folds, tallies=self.tallies))
+            if max((gain_sum(parts) for parts in again.values()), default=0.0) < self.threshold:
                 chosen = [other for other in chosen if other is not one]
         return chosen
 
@@ -261,143 +275,65 @@ class _Search:
         weight = explain_away(state, list(claim.parts)).weight
         views = {part.candidate.view for part in claim.parts}
         near = [one for one in self.candidates if one.view in views]
-        parts = _by_key(gains(near, state.reduced, replace(state, weight=weight), self.folds, tallies=self.tallies))
+        parts = by_key(gains(near, state.reduced, replace(state, weight=weight), self.folds, tallies=self.tallies))
         axes = set(claim.axes)
         mine = {key: [one for one in several if set(one.row) & axes] for key, several in parts.items()}
         key = claim.parts[0].candidate.key
-        gain = _sum(mine.get(key, [])) or claim.gain
+        gain = gain_sum(mine.get(key, [])) or claim.gain
         rivals = [
             several[0].candidate.effect
             for other, several in mine.items()
             if several
             and other != key
             and not other.startswith("~")
-            and _sum(several) >= gain - AMBIGUOUS
+            and gain_sum(several) >= gain - AMBIGUOUS
             and allowed(several[0].candidate.effect, several, state)
         ]
-        rivals += structural(claim.effect, claim.parts, state, {one.candidate.effect for several in parts.values() for one in several})
+        lines = {part.place for other in chosen for part in other.parts if part.candidate.effect == PLAIN_LINE}
+        rivals += structural(claim.effect, claim.parts, state, lines=len(lines))
         others = tuple(dict.fromkeys(name for name in [*claim.alternatives, *rivals] if name != claim.effect))
-        fresh = tuple(replace(part, gain=_gain_of(mine.get(key, []), part)) for part in claim.parts)
+        fresh = tuple(replace(part, gain=gain_of(mine.get(key, []), part)) for part in claim.parts)
         return replace(claim, gain=gain, alternatives=others, parts=fresh)
 
-    def _flexible(self, state: State, claims: Sequence[Claim], axis: str) -> State:
-        """The state with the next points of the nuisance grids beside those named: a time constant lies between two of them."""
-        row = state.axes.index(axis)
-        for part in (part for one in claims for part in one.parts if part.candidate.view == "mean" and part.row == (axis,)):
-            family = [one for one in part.candidate.variants if one.columns == part.variant.columns]
-            place = next(number for number, one in enumerate(family) if one is part.variant)
-            for other in family[max(place - 1, 0) : place] + family[place + 1 : place + 2]:
-                state = state.with_columns("mean", axis, mean_columns(other, row))
-        return state
-
-    def _complete(self, state: State, claims: list[Claim], unknown: Sequence[Unknown]) -> tuple[list[Claim], list[Unknown]]:
-        """Names are withdrawn where, with them in the model, the slow noise is still redder than calibrated."""
+    def _complete(self, start: State, state: State, claims: list[Claim], unknown: Sequence[Unknown]) -> tuple[list[Claim], list[Unknown]]:
+        """Names are withdrawn where, with them in the model, means are still redder than calibrated, or powers still restless."""
         kept, withdrawn = list(claims), []
         for axis in state.axes:
-            named = [one for one in kept if any(part.candidate.view == "mean" and part.row == (axis,) for part in one.parts)]
+            named = _on(kept, "mean", axis)
             if any(one.generic in ("~bias(t)", "~S(f)", "~cov") and axis in one.axes for one in unknown):
                 continue
             if any(part.candidate.effect in _SHAPES and axis in part.row for one in kept for part in one.parts):
                 continue  # the white variance of the means is not what the calibration took it for
-            red = redness(self._flexible(state, named, axis), axis, self.folds)
-            strength = sum(one.gain for one in named)
-            weak = [one for one in named if red > max(2.0 + FORM * strength, 0.1 * one.gain)]
-            if not weak and red <= self.threshold + FORM * strength:
-                continue
-            names = tuple(one.effect for one in weak)
-            kept = [one for one in kept if one not in weak]
-            withdrawn.append(Unknown("~red", (axis,), red, self.threshold, names))
+            red = redness(flexible(state, named, axis), axis, self.folds)
+            weak, strength = _weak(named, red)
+            if weak or red > self.threshold + FORM * strength:
+                kept = [one for one in kept if one not in weak]
+                withdrawn.append(Unknown("~red", (axis,), red, self.threshold, tuple(one.effect for one in weak)))
+        for axis in state.axes:
+            weak, _ = _weak(_on(kept, "power", axis), unrest(self._with(start, kept), axis)) if _on(kept, "power", axis) else ([], 0.0)
+            if weak:
+                kept = [one for one in kept if one not in weak]
+                withdrawn += self._restless(self._with(start, [*kept, *unknown]), axis, weak)
         return kept, withdrawn
 
-
-def redness(state: State, axis: str, folds: xr.DataArray) -> float:
-    """What free random walk and flicker gain over the calibrated ones, with all that is named in the model [nats].
-
-    Zero where the noise is less red than calibrated: a calibration on blocks that an effect touches takes it for noise.
-    """
-    given = state.given.get(("mean", axis))
-    beside = np.stack(given, axis=-1) if given else None
-    columns = [np.linspace(-1.0, 1.0, state.reduced.sizes["block"])] if not given else []
-    evidence, strength = [], []
-    span = state.reduced.sizes["block"] * float(state.reduced.attrs["block_s"])
-    slow = state.baseline["grid_K"].sel(axis=axis).values ** 2 * span / HOUR + state.baseline["grid_B"].sel(axis=axis).values ** 2
-    for tier in ("free", "calibrated"):
-        evidence.append(mean_factors(state.reduced, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds)[0, 0, 0])
-        strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))
-    return float(evidence[0] - evidence[1]) if strength[0] > strength[1] else 0.0
+    def _restless(self, state: State, axis: str, weak: Sequence[Claim]) -> list[Unknown]:
+        """What a free course of the noise explains on an axis, in place of names that do not."""
+        free = [one for one in self.candidates if one.effect == "~N(t)"]
+        parts = by_key(gains(free, state.reduced, state, self.folds)).get("~N(t)", [])
+        mine = [part for part in parts if part.row == (axis,) and part.gain > self.threshold]
+        return [unknown_of("~N(t)", mine, self.threshold, [one.effect for one in weak])] if mine else []
 
 
-# ------------------------------------------------------------------------------------------------------------------ parts
+def _on(claims: Sequence[Claim], view: str, axis: str) -> list[Claim]:
+    return [one for one in claims if any(part.candidate.view == view and part.row == (axis,) for part in one.parts)]
 
 
-def _parts(found: Found) -> list[Part]:
-    """Rows of a candidate that bring something."""
-    gain = found.gain[0]
-    rows = [number for number in range(gain.size) if gain[number] > _ROW]
-    rows = rows or [int(gain.argmax())]
-    return [
-        Part(
-            found.candidate,
-            found.best[number],
-            found.rows[number],
-            float(gain[number]),
-            int(found.place[0, number]) if found.place.size else -1,
-        )
-        for number in rows
-    ]
+def _weak(named: Sequence[Claim], left: float) -> tuple[list[Claim], float]:
+    """Claims that do not do enough beside what they leave [nats], and what all of them gain."""
+    strength = sum(one.gain for one in named)
+    return [one for one in named if left > max(_LEFT + FORM * strength, 0.1 * one.gain)], strength
 
 
-def _by_key(found: Sequence[Found]) -> dict[str, list[Part]]:
-    """Parts of every effect, those that bring something, the strongest first."""
-    out: dict[str, list[Part]] = {}
-    for one in found:
-        out.setdefault(one.candidate.key, []).extend(_parts(one))
-    for key, parts in out.items():
-        good = [part for part in parts if part.gain > _ROW]
-        out[key] = sorted(good or parts, key=lambda part: -part.gain)
-    return out
-
-
-def _sum(parts: Sequence[Part]) -> float:
-    return float(together(np.array([part.gain for part in parts]))) if parts else 0.0
-
-
-def _gain_of(parts: Sequence[Part], like: Part) -> float:
-    return next((one.gain for one in parts if one.candidate.view == like.candidate.view and one.row == like.row), like.gain)
-
-
-def _only(parts: Sequence[Part]) -> list[Candidate]:
-    seen: dict[tuple[str, str, tuple[str, ...]], Candidate] = {}
-    for part in parts:
-        seen[part.candidate.key, part.candidate.view, part.candidate.witness] = part.candidate
-    return list(seen.values())
-
-
-def _axes(parts: Sequence[Part], order: Sequence[str]) -> tuple[str, ...]:
-    named = {axis for part in parts for axis in part.row}
-    return tuple(sorted(named, key=lambda axis: (order.index(axis) if axis in order else 0, axis)))
-
-
-def _form_error(parts: Sequence[Part], chosen: Sequence[Claim | Unknown]) -> float:
-    """What errors of the form of what is named already may leave in the views and axes of these parts [nats]."""
-    left = 0.0
-    for one in chosen:
-        for part in one.parts:
-            if any(part.candidate.view == other.candidate.view and set(part.row) & set(other.row) for other in parts):
-                left += FORM * part.gain
-    return left
-
-
-def _unknown(key: str, parts: list[Part], threshold: float, near: Sequence[str]) -> Unknown:
-    return Unknown(key, _axes(parts, ()), _sum(parts), threshold, tuple(dict.fromkeys(near)), tuple(parts))
-
-
-def _merged(chosen: list[Claim | Unknown], one: Claim | Unknown) -> list[Claim | Unknown]:
-    """The list with another claim; one of the same effect and channel becomes one with it."""
-    for place, other in enumerate(chosen):
-        if isinstance(one, Claim) and isinstance(other, Claim) and (other.effect, other.driver) == (one.effect, one.driver):
-            axes = tuple(sorted({*other.axes, *one.axes}))
-            alike = tuple(dict.fromkeys([*other.alternatives, *one.alternatives]))
-            both = replace(other, axes=axes, parts=(*other.parts, *one.parts), gain=other.gain + one.gain, alternatives=alike)
-            return [*chosen[:place], both, *chosen[place + 1 :]]
-    return [*chosen, one]
+def _witnessed(parts: Sequence[Part], state: State) -> list[Part]:
+    """Parts that a channel sees as well, which is no axis of the gyro itself."""
+    return [part for part in parts if part.candidate.view == "transfer" and part.candidate.witness[0] not in state.axes]

@@ -12,7 +12,6 @@ from gyrostab.diagnose.search import Tallies
 
 __all__ = ["line_size", "mark_sizes"]
 
-_REACH = 3
 _PER_SPIKE = 3.0  # second differences that hold a spike
 _LIMIT = 6.0  # standard deviations beyond which one counts as an outlier
 Pair = tuple[float, float]
@@ -20,7 +19,7 @@ Pair = tuple[float, float]
 
 def line_size(reduced: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
     """Amplitude [degree hour-1] and frequency [Hz] of a line, each with its error, from the power about it that is above the level."""
-    from gyrostab.diagnose.tallies import local_level
+    from gyrostab.diagnose.lines import line_skirt, local_level
 
     lines = reduced["line_frequency"].values
     weight = reduced["line_weight"].sel(axis=axis).values
@@ -28,7 +27,7 @@ def line_size(reduced: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
     level = local_level(total[None, None])[0, 0]
-    near = slice(max(place - _REACH, 0), place + _REACH + 1)
+    near = line_skirt(reduced, axis, place)
     step = float(np.diff(lines[:2])[0])
     above = total[near] - level[near]
     square = 4.0 * max(float(above.sum()) * step, 0.0)

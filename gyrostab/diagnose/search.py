@@ -13,6 +13,7 @@ from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, cells_of, drawn, view_rows
 from gyrostab.diagnose.folds import fold_subsets
 from gyrostab.diagnose.gain import cell_factors, mean_factors, score
+from gyrostab.diagnose.lines import expected_lines, line_gains
 from gyrostab.diagnose.tallies import (
     OF_LATTICE,
     Expected,
@@ -20,8 +21,6 @@ from gyrostab.diagnose.tallies import (
     count_gains,
     expected_counts,
     kurtosis_gains,
-    line_gains,
-    still_scatter,
 )
 
 __all__ = ["Found", "Tallies", "gains", "together", "totals"]
@@ -56,12 +55,13 @@ class Found:
 
 @dataclass(frozen=True)
 class Tallies:
-    """What null records say of counts: (mean, spread) by name; of a block."""
+    """What null records say of counts: (mean, spread) by name; of a block. And the axes whose rate was rounded to a lattice."""
 
     of: dict[str, tuple[Array, Array]]
+    rounded: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     @classmethod
-    def gathered(cls, expected: Expected) -> Tallies:
+    def gathered(cls, expected: Expected, rounded: NDArray[np.bool_]) -> Tallies:
         """From all null records."""
         found = {}
         for name, parts in expected.sums.items():
@@ -74,7 +74,7 @@ class Tallies:
                 found[name] = (np.nanmean(clean, axis=(0, 2)), np.nanstd(clean, axis=(0, 2)))
             else:
                 found[name] = expected_counts(values)
-        return cls(found)
+        return cls(found, rounded)
 
 
 def gains(
@@ -194,7 +194,7 @@ def _mark(name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_],
     """Gain of a raised statistic, (record, axis)."""
     records = data.sizes.get("record", 1)
     if name == "lattice":
-        return np.broadcast_to(_lattice(state) if "record" not in data.dims else np.zeros(len(state.axes)), (records, len(state.axes)))
+        return np.broadcast_to(_lattice(state, tallies) if "record" not in data.dims else 0.0, (records, len(state.axes)))
     if name not in data or name not in tallies.of:
         return np.zeros((records, len(state.axes)))
     values = data[name].transpose(..., "axis", "block").values.astype(np.float64)
@@ -203,20 +203,17 @@ def _mark(name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_],
     return how(values, *tallies.of[name], subsets)
 
 
-_COARSE = 0.1  # of the scatter of the samples: a finer lattice is lost in it
-
-
-def _lattice(state: State) -> Array:
-    """Samples on a lattice that is coarse enough to matter, one nat each: noise without one never stands on it."""
-    reduced = state.reduced
-    matters = reduced["lattice"].values > _COARSE * still_scatter(reduced)
-    return np.where(matters, reduced["samples"].values.sum(axis=1), 0.0).astype(np.float64)
+def _lattice(state: State, tallies: Tallies) -> Array:
+    """Samples of a rounded rate, one nat each: noise without a lattice never stands on it."""
+    samples = state.reduced["samples"].transpose("axis", "block").values.sum(axis=1)
+    return np.where(tallies.rounded, samples, 0.0).astype(np.float64) if tallies.rounded.size else np.zeros(samples.size)
 
 
 def _lines(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[Found]:
     power = data["line_power"].transpose(..., "axis", "part", "line").values
     power = power if power.ndim == 4 else power[None]
-    gain = line_gains(power, state.reduced["line_weight"].transpose("axis", "part").values)
+    expected = expected_lines(state.baseline, state.reduced["line_frequency"].values)
+    gain = line_gains(power, state.reduced["line_weight"].transpose("axis", "part").values, expected)
     taken = state.given.get(("line", "all"), [])
     for mask in taken:
         gain = np.where(mask, -np.inf, gain)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -48,11 +48,11 @@ def _moves(axis: str, state: State) -> bool:
     return bool(np.nanmax(np.nanmean(state.reduced["power"].values[row] / expected, axis=0)) > _MOVING)
 
 
-def structural(effect: str, parts: Sequence[Part], state: State, tried: Collection[str]) -> list[str]:
-    """Effects that are part of the answer by their nature."""
+def structural(effect: str, parts: Sequence[Part], state: State, *, lines: int = 0) -> list[str]:
+    """Effects that are part of the answer by their nature; `lines` are named in all."""
     out = list(STRUCTURAL.get(effect, ()))
     reduced = state.reduced
-    if effect == "spectral_line" and "profile" not in reduced and len({part.place for part in parts}) >= _COMB:
+    if effect == "spectral_line" and "profile" not in reduced and lines >= _COMB:
         out.append("feedback_reset")
     if effect == "vibration_rectification":
         vibration = reduced[f"channel_{parts[0].candidate.driver[0]}"].values

@@ -1,8 +1,7 @@
-"""Counts of odd samples and lines in the spectrum: gains of what is not linear in a few designs."""
+"""Counts of odd samples: gains of what is not linear in a few designs."""
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,6 @@ __all__ = [
     "count_gains",
     "expected_counts",
     "kurtosis_gains",
-    "line_gains",
-    "local_level",
     "still_scatter",
 ]
 
@@ -31,7 +28,6 @@ COUNTS = ("outliers", "repeats", "extremes", "zeros")
 OF_LATTICE = ("repeats", "extremes", "zeros", "kurtosis")
 _COARSE, _STILL = 0.2, 0.1  # step in scatters of the samples; share of the blocks that tell the scatter at rest
 _SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
-_NEIGHBOURS = 25  # lines on each side that tell the level
 
 
 def coarse_lattice(reduced: xr.Dataset) -> NDArray[np.bool_]:
@@ -138,44 +134,3 @@ def kurtosis_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[n
         part = size * subset.mean()
         found.append(0.5 * total**2 * part / (1.0 + part) * (total > 0) - 0.5 * np.log1p(part))
     return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
-
-
-def line_gains(power: Array, weight: Array) -> Array:
-    """Gain of a steady line on the parts of the record that were held out, less the logarithm of the number of lines.
-
-    Parameters
-    ----------
-    power : ndarray, shape (record, axis, part, line)
-        Mean periodograms.
-    weight : ndarray, shape (axis, part)
-        Independent periodograms in each mean.
-
-    Returns
-    -------
-    ndarray, shape (record, axis, line)
-    """
-    usable = (weight > 0) & np.isfinite(power).all(axis=(0, 3))
-    share = np.where(usable, weight, 0.0)[..., None]
-    clean = np.where(usable[..., None], power, 0.0)
-    total = (clean * share).sum(axis=2) / np.maximum(share.sum(axis=1), 1e-9)
-    level = local_level(total)[:, :, None]
-    ratio = clean / level
-    gain = np.zeros(total.shape)
-    for number in range(FOLDS):
-        held = np.arange(power.shape[2]) % FOLDS == number
-        train = np.maximum(share[:, ~held].sum(axis=1), 1e-9)
-        excess = np.maximum((ratio[:, :, ~held] * share[:, ~held]).sum(axis=2) / train - 1.0, 0.0)[:, :, None]
-        gain += (share[:, held] * (ratio[:, :, held] * excess / (1.0 + excess) - np.log1p(excess))).sum(axis=2)
-    return np.asarray(gain - np.log(power.shape[3]))
-
-
-def local_level(total: Array) -> Array:
-    """Medians over stretches of lines, and straight lines between their middles."""
-    count = total.shape[-1]
-    ends = np.linspace(0, count, max(1, count // (2 * _NEIGHBOURS)) + 1).astype(int)
-    medians = np.stack([np.median(total[..., low:high], axis=-1) for low, high in pairwise(ends)], axis=-1)
-    middle = (ends[1:] + ends[:-1] - 1) / 2.0
-    place = np.clip(np.interp(np.arange(count), middle, np.arange(middle.size)), 0.0, middle.size - 1.0)
-    low = np.minimum(place.astype(int), max(middle.size - 2, 0))
-    high = np.minimum(low + 1, middle.size - 1)
-    return np.asarray(medians[..., low] + (place - low) * (medians[..., high] - medians[..., low]))

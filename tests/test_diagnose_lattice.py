@@ -1,0 +1,83 @@
+"""A lattice of rounded rates is told from one of angle steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from threadpoolctl import threadpool_limits
+
+from gyrostab.diagnose.baseline import calibrate, from_model
+from gyrostab.diagnose.lattice import angle_share, rounded_rates
+from gyrostab.diagnose.name import name_effects
+from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.log import make_log
+from tests.named import nulls
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """As `gyrostab.diagnose` has it."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
+
+
+SCATTER = 0.003 * 60.0 * np.sqrt(10.0)  # of a sample at 10 Hz [deg/h]
+
+
+def on_lattice(kind: str, steps: float, *, mean: float = 3.0, seed: int = 1, size: int = 18_000) -> xr.Dataset:
+    """White noise on two axes that stands on a lattice of so many scatters of its samples."""
+    rng = np.random.default_rng(seed)
+    rates = mean * np.array([[1.0], [-2.3]]) + SCATTER * rng.standard_normal((2, size))
+    step = steps * SCATTER
+    if kind == "angle":
+        counted = np.diff(np.floor(np.cumsum(rates, axis=1) / step + 0.3), axis=1, prepend=0.0) * step
+        return reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
+    return reduce_log(make_log(np.rint(rates / step) * step, rate=10.0, unit="deg/h"))
+
+
+@pytest.mark.parametrize("steps", [1.5, 2.0, 4.0])
+@pytest.mark.parametrize("mean", [3.0, 0.05])
+def test_coarse_steps_are_told_apart(steps: float, mean: float) -> None:
+    for kind, expected in (("rate", True), ("angle", False)):
+        reduced = on_lattice(kind, steps, mean=mean)
+        np.testing.assert_allclose(reduced["lattice"], steps * SCATTER, rtol=1e-6)
+        assert (rounded_rates(reduced, calibrate(reduced)) == expected).all(), kind
+
+
+@pytest.mark.parametrize("kind", ["rate", "angle"])
+def test_fine_steps_are_nobodys(kind: str) -> None:
+    reduced = on_lattice(kind, 0.3)
+    assert (reduced["lattice"] > 0).all()
+    assert not rounded_rates(reduced, calibrate(reduced)).any()
+
+
+def test_without_a_lattice_nothing_was_rounded() -> None:
+    reduced = on_lattice("rate", 2.0)
+    plain = reduced.assign(lattice=reduced["lattice"] * 0.0)
+    assert not rounded_rates(plain, calibrate(reduced)).any()
+
+
+def test_a_model_does_not_say_what_the_record_is() -> None:
+    model = {"noise": {"N": 0.003, "Q": 0.1}, "log": {"axes": ["axis_0", "axis_1"]}}
+    for kind, expected in (("rate", True), ("angle", False)):
+        reduced = on_lattice(kind, 2.0)
+        assert (rounded_rates(reduced, from_model(reduced, model)) == expected).all()
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.13, 0.5])
+@pytest.mark.parametrize("scatter", [0.1, 0.4, 1.0])
+def test_the_share_of_a_counter_is_that_of_its_errors(mean: float, scatter: float) -> None:
+    steps = mean + scatter * np.random.default_rng(1).standard_normal(400_000)
+    angle = np.cumsum(steps)
+    errors = np.diff(np.rint(angle + 0.37) - angle)
+    assert float(angle_share(np.array([mean]), scatter)[0]) == pytest.approx(np.var(errors) * 6.0, rel=0.02)
+
+
+@pytest.mark.parametrize(("kind", "names"), [("rate", ["rate_quantization"]), ("angle", [])])
+def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
+    reduced = on_lattice(kind, 2.0, size=9_000)
+    baseline, records = nulls(reduced, 40)
+    found = name_effects(reduced, baseline, records)
+    assert [claim.effect for claim in found.claims] == names
+    assert ("lattice" in found.reasons.get("rate_quantization", "")) == (kind == "angle")
