@@ -156,7 +156,9 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.sqrt(recording / avar.sel(case=name).values)
             usual = (recording >= low.sel(case=name).values) & (recording <= high.sel(case=name).values)
-        columns.append((f"Recording over simulation, {'without' if name == 'before' else 'with'} the effects", ratio, np.where(usual, _PALE, 1.0)))
+        columns.append(
+            (f"Recording over simulation, {'without' if name == 'before' else 'with'} the effects", ratio, np.where(usual, _PALE, 1.0))
+        )
     figure = _maps(surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations")
     bar = figure.axes[-1]
     bar.yaxis.set_major_locator(FixedLocator([0.5, 0.7, 1.0, 1.4, 2.0]))
