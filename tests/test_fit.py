@@ -15,7 +15,7 @@ from gyrostab.confidence import confidence_interval
 from gyrostab.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.fit import fit_noise
-from gyrostab.kernels.covariance import pair_products
+from gyrostab.kernels.covariance import product_tables
 from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
 from gyrostab.kernels.limits import interpolate_quantile
 from gyrostab.kernels.nonnegative import solve_nonnegative
@@ -83,7 +83,7 @@ def test_degrees_of_freedom_are_those_of_greenhall():
     for alpha, term in ((0, 1), (-1, 2), (-2, 3)):
         for k in (20, 100, 333):
             ks = np.array([k])
-            product = pair_products(window, ks, np.zeros(1, dtype=np.int64))[term, term, 0, 0]
+            product = product_tables(window, ks, np.zeros(1, dtype=np.int64))[0][term, term, 0, 0]
             mean = {1: 1 / k, 2: 2 * np.log(2) / np.pi, 3: k / 3}[term]
             expected = edf_greenhall(alpha, 2, k, window + 1, overlapping=True, modified=False)
             assert 2 * mean**2 / product == pytest.approx(expected, rel=0.05)
@@ -113,7 +113,7 @@ def test_covariance_between_averaging_times_is_that_of_simulated_noise():
     from gyrostab.noise import sample_squares
 
     squares = np.array([0.2, 0.01, 0.0, 30.0]) ** 2 * sample_squares(RATE)[:4]
-    predicted = np.einsum("a,b,abij->ij", squares, squares, pair_products(600, ks, np.zeros_like(ks)))
+    predicted = np.einsum("a,b,abij->ij", squares, squares, product_tables(600, ks, np.zeros_like(ks))[0])
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     np.testing.assert_allclose(np.cov(avar.T) / scale, predicted / scale, atol=0.12)
 
@@ -356,7 +356,7 @@ def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
     for k in ks:
         rows = [np.concatenate([np.zeros(m), -np.ones(k), np.ones(k), np.zeros(window - m - 2 * k)]) for m in range(window - 2 * k + 1)]
         differences.append(np.array(rows))
-    got = pair_products(window, ks, np.zeros_like(ks))
+    got, _ = product_tables(window, ks, np.zeros_like(ks))
     for i, first in enumerate(differences):
         for j, second in enumerate(differences):
             white_part = first @ second.T / (2.0 * ks[i] * ks[j])

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.nonnegative import REORDER
 
-__all__ = ["STOCHASTIC", "diagonal_products", "pair_products", "product_tables"]
+__all__ = ["STOCHASTIC", "diagonal_products", "product_tables"]
 
 #: Number of stochastic terms: quantization, angle random walk, bias instability, rate random walk.
 STOCHASTIC = 4
@@ -230,11 +230,6 @@ def product_tables(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
     factors = np.asarray(ks, dtype=np.float64)
     products, means = _tables(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
     return np.asarray(2.0 * products), np.asarray(2.0 * factors[:, None] * factors[None, :] * means)
-
-
-def pair_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The first of `product_tables`."""
-    return product_tables(window, ks, shifts)[0]
 
 
 @njit(**KERNEL)
