@@ -33,6 +33,7 @@ Array = NDArray[Any]
 #: Where an effect can show, in the order in which they are looked at.
 VIEWS = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander")
 _MOST_VALUES, _MOST_VARIANTS = 60, 200
+_INSTANT = "at"  # nuisance parameter that is an instant
 _LEAST_SHARE = 0.5  # of the blocks in which a channel must have data
 _TWINS = {"fringe_hop": "bias_jump"}  # the same design: the size decides
 _SAME = 1e-3  # designs that differ by less of their size are one
@@ -197,6 +198,7 @@ def _of_kind(kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], c
     made = []
     for view, build in BUILDERS.items():
         variants = _distinct([one for values, seen in predictions for one in build(values, seen, reduced, coefficient)])
+        variants = _weighed(variants, windows)
         if not variants:
             continue
         marks = tuple(dict.fromkeys(mark for _, seen in predictions for mark in seen.marks)) if view == "marks" else ()
@@ -222,7 +224,9 @@ def _inner(drivers: Mapping[str, str], name: str) -> str:
 def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
     """Values of the nuisance parameters, and of the words."""
     try:
-        grid: dict[str, Sequence[Any]] = {name: _thinned(values) for name, values in kind.example().nuisance(windows).items()}
+        grid: dict[str, Sequence[Any]] = {
+            name: _thinned(values, _known_instants(name, windows)) for name, values in kind.example().nuisance(windows).items()
+        }
     except KeyError:
         grid = {}
     grid |= {item.name: item.choices for item in kind.parameters() if item.choices}
@@ -235,9 +239,25 @@ def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
         yield {name: value if isinstance(value, str) else float(value) for name, value in zip(grid, point, strict=True)}
 
 
-def _thinned(values: Array) -> list[Any]:
+def _thinned(values: Array, known: Array) -> list[Any]:
+    """Some of the values, and those that are known beforehand."""
     every = max(1, -(-len(values) // _MOST_VALUES))
-    return list(values[every // 2 :: every])
+    kept = values[every // 2 :: every]
+    return list(kept) if every == 1 or not known.size else list(np.unique(np.concatenate([kept, known])))
+
+
+def _known_instants(name: str, windows: Windows) -> Array:
+    """Instants at which something happened to the instrument, where a nuisance parameter is the instant of something."""
+    return windows.restarts[:, 1] if name == _INSTANT else np.empty(0)
+
+
+def _weighed(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
+    """Variants with the chance that something happens when power comes back: as likely as at all other times together."""
+    known = [_INSTANT in one.values and bool(np.isclose(windows.restarts[:, 1], one.values[_INSTANT]).any()) for one in variants]
+    if not any(known) or all(known):
+        return variants
+    share = known.count(False) / known.count(True)
+    return tuple(replace(one, weight=share) if at else one for one, at in zip(variants, known, strict=True))
 
 
 def _exogenous(effect: Effect, windows: Windows) -> Prediction:

@@ -37,6 +37,8 @@ class Variant:
         The parameter enters by its square.
     time : float
         Of a random mean: the time constant of its memory [s], inf for a walk.
+    weight : float
+        Chance of this point before the data are seen, against those of the other variants of the candidate.
     """
 
     values: Mapping[str, Any]
@@ -44,6 +46,7 @@ class Variant:
     design: Array
     squared: bool = False
     time: float = np.inf
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)

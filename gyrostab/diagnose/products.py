@@ -199,7 +199,7 @@ def evidence(products: Products, designs: Sequence[NDArray[np.int64]], limits: A
     return out
 
 
-def score(factors: Array, owner: Sequence[int] | NDArray[np.int64], *, folds: int = FOLDS) -> Array:
+def score(factors: Array, owner: Sequence[int] | NDArray[np.int64], *, weight: Sequence[float] | None = None, folds: int = FOLDS) -> Array:
     """Held-out gain of candidates, the largest over the lengths of the folds.
 
     Parameters
@@ -208,17 +208,28 @@ def score(factors: Array, owner: Sequence[int] | NDArray[np.int64], *, folds: in
         Logarithms of Bayes factors [nats] on the subsets of `fold_subsets`, without the column of the evidence of none. Factors of
         data that are independent, as means and powers, may be added before.
     owner : sequence of int, shape (design,)
-        Number of the candidate to which each design belongs; its designs have equal weight.
+        Number of the candidate to which each design belongs.
+    weight : sequence of float, shape (design,), optional
+        Chance of each design before the data are seen, against the others of its candidate; all alike by default.
 
     Returns
     -------
     ndarray, shape (candidate, record)
         Sum over the folds of log Bayes factor on all less that on all but the fold [nats].
+
+    Examples
+    --------
+    >>> factors = np.zeros((5, 2, 1))
+    >>> factors[0, 1], factors[1:, 1] = 8.0, 6.0
+    >>> [float(score(factors, [0, 0], weight=share)[0, 0].round(2)) for share in ([1.0, 1.0], [1.0, 9.0])]
+    [7.99, 8.0]
     """
     owner = np.asarray(owner)
+    chance = np.zeros(owner.size) if weight is None else np.log(np.asarray(weight, dtype=np.float64))
     out = []
     for candidate in range(int(owner.max()) + 1 if owner.size else 0):
         chosen = owner == candidate
-        mixed = np.logaddexp.reduce(factors[:, chosen], axis=1) - np.log(chosen.sum())
+        own = chance[chosen] - np.logaddexp.reduce(chance[chosen])
+        mixed = np.logaddexp.reduce(factors[:, chosen] + own[:, None], axis=1)
         out.append((mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1).max(axis=0))
     return np.array(out).reshape(len(out), factors.shape[2])

@@ -136,8 +136,9 @@ def _collect(group: Sequence[Candidate], rows: list[tuple[str, ...]], factors: l
     """From the factors of all variants of a group, row by row."""
     variants = [[one for one in each.variants for _ in range(spread)] for each in group]
     owner = np.repeat(np.arange(len(group)), [len(several) for several in variants])
-    gain = np.stack([score(one, owner) for one in factors], axis=-1)  # (candidate, record, row)
-    first = np.stack([one[0, :, 0] for one in factors], axis=-1)  # (design, row)
+    weight = [one.weight for several in variants for one in several]
+    gain = np.stack([score(one, owner, weight=weight) for one in factors], axis=-1)  # (candidate, record, row)
+    first = np.stack([one[0, :, 0] for one in factors], axis=-1) + np.log(weight)[:, None]  # (design, row)
     out = []
     for number, each in enumerate(group):
         own = first[owner == number]
