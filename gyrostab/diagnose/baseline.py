@@ -23,10 +23,11 @@ from gyrostab.noise import HOUR, LAWS, TERMS
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.simulate.model import Model, read_model
 
-__all__ = ["assemble", "calibrate", "from_model", "from_simulation", "grid_values", "known_effects"]
+__all__ = ["DRAWS", "assemble", "calibrate", "drivers_of", "from_model", "from_simulation", "grid_values", "known_effects"]
 
 Array = NDArray[np.float64]
-_DRAWS = 512
+#: Draws from the posterior of the noise of an axis.
+DRAWS = 512
 #: Values of K and B that the noise may have instead, as multiples of the calibrated ones.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
 _LOW_SHAPE = 20.0  # of the lowest bands, which say how noisy the mean of a block is
@@ -127,7 +128,7 @@ def _posteriors(reduced: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterio
         square = np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0])
         variance = white_variance(reduced, np.tile(square, (len(mean), 1)))[row]
         present = use & np.isfinite(mean[row])
-        found.append(noise_posterior(fit, mean[row], variance, present, step=step, draws=_DRAWS, rng=np.random.default_rng(row)))
+        found.append(noise_posterior(fit, mean[row], variance, present, step=step, draws=DRAWS, rng=np.random.default_rng(row)))
     return found
 
 
@@ -262,7 +263,7 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
         square = np.array([coefficients[term] ** 2 for term in NOISE])
         if not square.any():
             raise OptionError(f"{made.source}: axis {axis} has no noise to compare a recording with; give N in [noise] or [noise.{axis}]")
-        draws = np.tile(square, (_DRAWS, 1))
+        draws = np.tile(square, (DRAWS, 1))
         K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
         found.append(Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True))
     mean, spectrum, left_out = known_effects(reduced, made, np.stack([one.square for one in found]))
@@ -329,7 +330,7 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> tuple[Arr
     added, response, left_out = np.zeros(columns.shape[:3]), np.ones((len(axes), 1, columns.shape[2])), []
     for effect in model.effects:
         rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
-        drivers = {role: effect.channel_names()[role] for role in effect.needs()}
+        drivers = drivers_of(effect)
         present = [str(name).removeprefix("channel_") for name in reduced.data_vars if str(name).startswith("channel_")]
         for role, name in drivers.items():
             if name not in present:
@@ -350,6 +351,11 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> tuple[Arr
         if elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None):
             left_out.append(effect.name)
     return mean, (np.einsum("abfn,abn->abf", columns, np.maximum(level, 0.0)) + added) * response, left_out
+
+
+def drivers_of(effect: Effect) -> dict[str, str]:
+    """Channel of the effect -> its name in the log."""
+    return {role: effect.channel_names()[role] for role in effect.needs()}
 
 
 def _sizes(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:

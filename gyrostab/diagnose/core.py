@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.diagnose.account import explanations
 from gyrostab.diagnose.baseline import calibrate, from_model, from_simulation
@@ -29,6 +30,7 @@ from gyrostab.diagnose.evidence import held_out
 from gyrostab.diagnose.locate import locate
 from gyrostab.diagnose.name import Naming, name_effects
 from gyrostab.diagnose.null_scores import NullScores, null_scores
+from gyrostab.diagnose.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.reduced import reduce_log
 from gyrostab.diagnose.refit import fit_claims, limits, predicted
 from gyrostab.diagnose.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
@@ -137,7 +139,7 @@ def _diagnose(
     naming = name_effects(reduced, baseline, records(), level=level / 2.0, seed=seed, progress=progress)
     progress("fitting", 0)
     own = given if isinstance(given, Model) else None
-    return _concluded(reduced, baseline, found, naming, null, level=level, own=own, begun=begun)
+    return _concluded(reduced, baseline, found, naming, null, level=level, given=own, begun=begun)
 
 
 def _check_options(nulls: int, level: float, seed: int) -> None:
@@ -203,14 +205,22 @@ def _concluded(
     null: NullScores,
     *,
     level: float,
-    own: Model | None,
+    given: Model | None,
     begun: float,
 ) -> Diagnosis:
     """Fit what was named, see what it is worth and what is left, and put it all into one result."""
-    fitted = fit_claims(naming, baseline)
-    after = predicted(naming, baseline) if naming.claims else baseline
+    first = fit_claims(naming, baseline)
+    noise = recalibrate(naming, baseline, first)
+    naming, raw = (naming, naming) if noise is baseline else (with_noise(naming, noise), naming)
+    fitted = first if noise is baseline else fit_claims(naming, noise)
+    after = predicted(naming, noise) if naming.claims else baseline
+
+    def trained(known: NDArray[np.bool_]) -> xr.Dataset:
+        own = recalibrate(raw, baseline, first, known)
+        return predicted(with_noise(raw, own), own, known)
+
     odd = sum(part.gain for claim in naming.claims for part in claim.parts if part.candidate.view == "marks")  # no other number has them
-    held = held_out(reduced, baseline, (lambda known: predicted(naming, baseline, known)) if naming.claims else baseline, more_gain=odd)
+    held = held_out(reduced, baseline, trained if naming.claims else baseline, more_gain=odd)
     mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level / 2.0))
     mismatches += claim_tables(naming, reduced, mismatches)
     mismatches += unknown_tables(naming, reduced, mismatches)
@@ -229,7 +239,7 @@ def _concluded(
         "seconds": round(time.perf_counter() - begun, 3),
     }
     surfaces = surfaces_with_blocks(make_surfaces(reduced, baseline, after), reduced, baseline, after)
-    diagnosis = Diagnosis(plain(content), surfaces, model_tables(baseline, fitted, own))
+    diagnosis = Diagnosis(plain(content), surfaces, model_tables(noise, fitted, given))
     check_diagnosis(diagnosis.content)
     return diagnosis
 

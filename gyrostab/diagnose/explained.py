@@ -12,6 +12,7 @@ from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, harmonic_sets, order_columns, pair_rows, power_column
 from gyrostab.diagnose.gain import noise_columns
 from gyrostab.diagnose.lines import line_skirt
+from gyrostab.diagnose.response import is_filter, straightened
 from gyrostab.physics.phase import fold
 
 __all__ = ["Part", "explain_away", "mean_columns", "reweighted", "take_part", "without_turns"]
@@ -92,6 +93,11 @@ def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
 def _power(state: State, part: Part) -> State:
     axis = part.row[0]
     row = state.axes.index(axis)
+    if is_filter("power", part.variant) and "line_power" in state.reduced:
+        reduced, stopped = straightened(state.reduced, axis, part.candidate.effect, part.variant.values)
+        state = replace(state, reduced=reduced).with_columns("line", "all", [stopped])
+    if is_filter("power", part.variant) and axis in state.baseline.attrs.get("recalibrated", ()):
+        return state  # the noise of the baseline is filtered already
     return state.with_columns("power", axis, [power_column(one, row, state) for one in part.variant.design])
 
 

@@ -15,6 +15,7 @@ from gyrostab.diagnose.cells import State, begin_state
 from gyrostab.diagnose.claims import Claim, Naming, Unknown, form_error, unknown_of, with_claim
 from gyrostab.diagnose.complete import flexible, redness, unrest
 from gyrostab.diagnose.explained import Part, explain_away
+from gyrostab.diagnose.filters import without_slopes
 from gyrostab.diagnose.folds import fold_blocks
 from gyrostab.diagnose.generics import generic_candidates
 from gyrostab.diagnose.lattice import rounded_rates
@@ -205,7 +206,7 @@ class _Search:
         odd = [key for key in passing if parts[key][0].candidate.view == "marks" and not key.startswith("~")]
         shared = [key for key in passing if gain_sum(_witnessed(parts[key], state)) > need[key]]
         # odd samples first: they raise powers and means too, and not the other way round; then motion that another sensor sees as well
-        passing = odd or shared or self._without_locked_lines(passing, parts, state)
+        passing = odd or shared or without_slopes(self._without_locked_lines(passing, parts, state), parts, state, self.folds)
         if not passing:
             return None
         top = gain_sum(parts[passing[0]])

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, begin_state, pair_rows
 from gyrostab.diagnose.explained import Part, explain_away, mean_columns
+from gyrostab.diagnose.filters import filter_sizes
 from gyrostab.diagnose.name import AMBIGUOUS, Claim, Naming
 from gyrostab.diagnose.odd import line_size, mark_sizes
 from gyrostab.diagnose.predict import predicted
+from gyrostab.diagnose.response import is_filter
 from gyrostab.diagnose.sizes import Mixture, part_mixture
 from gyrostab.errors import GyrostabError
 from gyrostab.physics.base import Effect
@@ -117,7 +119,8 @@ def _fit_claim(claim: Claim, state: State, naming: Naming) -> list[Fitted]:
     views = {part.candidate.view for part in claim.parts}
     kind = effects()[claim.effect]
     many = any(item.many for item in kind.parameters() if item.name in kind.size_parameters)
-    together = many or "cross" in views or any(not part.candidate.each for part in claim.parts)
+    filtered = any(is_filter(part.candidate.view, part.variant) for part in claim.parts)  # one logger: its axes are filtered alike
+    together = many or filtered or "cross" in views or any(not part.candidate.each for part in claim.parts)
     if together:
         return [_fitted(claim, claim.axes, list(claim.parts), state, naming)]
     return [_fitted(claim, (axis,), [part for part in claim.parts if axis in part.row], state, naming) for axis in claim.axes]
@@ -132,7 +135,10 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
     for part in parts:
         by_view.setdefault(part.candidate.view, []).append(part)
     view = max(by_view, key=lambda name: sum(part.gain for part in by_view[name]))
-    sizes = _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
+    filtered = is_filter(view, by_view[view][0].variant)
+    sizes = {} if filtered else _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
+    if filtered:
+        sizes, values = filter_sizes(by_view[view], state)
     for name, (mean, sd) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
         estimates[name] = _estimate(mean, sd, unit, positive=_positive(kind, name))
@@ -252,9 +258,7 @@ def _linear(parts: list[Part], axes: tuple[str, ...], state: State, naming: Nami
     """Parameters of means, powers, profiles and transfers; by axis where there are several."""
     out: dict[str, tuple[float, float]] = {}
     for part in parts:
-        if part.variant.columns[:1] == ("any",) or not part.variant.columns:
-            if not part.variant.columns:
-                out |= {name: (float(value), 0.0) for name, value in _mixture_free(part, state, naming).items()}
+        if part.variant.columns[:1] == ("any",):
             continue
         mixture, nuisance = _mixture(part, state, naming)
         mean, covariance = mixture.moments()
@@ -265,11 +269,6 @@ def _linear(parts: list[Part], axes: tuple[str, ...], state: State, naming: Nami
             out[name if len(axes) == 1 else f"{name}.{part.row[0]}"] = (value, sd)
         out |= nuisance
     return out
-
-
-def _mixture_free(part: Part, state: State, naming: Naming) -> dict[str, float]:
-    """Nuisance values of an effect that has nothing else (a filter): those of its best variant."""
-    return {name: value for name, value in part.variant.values.items() if not isinstance(value, str)}
 
 
 def _root(square: float, sd: float) -> tuple[float, float]:
