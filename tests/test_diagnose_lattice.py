@@ -59,7 +59,7 @@ def test_without_a_lattice_nothing_was_rounded() -> None:
 
 
 def test_a_model_does_not_say_what_the_record_is() -> None:
-    model = {"noise": {"N": 0.003, "Q": 0.1}, "log": {"axes": ["axis_0", "axis_1"]}}
+    model = {"noise": {"N": 0.003, "Q": 0.1}, "log": {"axes": ["x", "y"]}}
     for kind, expected in (("rate", True), ("angle", False)):
         reduced = on_lattice(kind, 2.0)
         assert (rounded_rates(reduced, from_model(reduced, model)) == expected).all()
