@@ -205,6 +205,49 @@ def test_a_diagnosis_that_fails_is_shown_and_tried_again(small, tmp_path, monkey
     assert again.table.set_index("quantity").loc["detected at 1.5 times the limit and more", "value"] == 1.0
 
 
+class NothingFound:
+    def to_json(self) -> str:
+        return json.dumps({"verdict": "no mismatch", "mismatches": [], "effects": [], "unexplained": [], "held_out": {}})
+
+
+def test_real_recordings_are_salted_sealed_and_told_apart(small, tmp_path, monkeypatch, recordings):
+    real = recordings("mems-static-53min/ch104.csv.gz").parents[1]
+    monkeypatch.setattr(core, "_SALTED", 1)
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
+    said: list[str] = []
+    proof = gyrostab.prove(tmp_path / "proof", cases=2, seed=8, nulls=100, workers=0, real=real, say=said.append)
+    assert "2 real recordings" in said[0]
+    sums, _ = read_sums(tmp_path / "proof")
+    assert len(sums) == 2 + 2 * 4
+    for path in (tmp_path / "proof" / "recordings").iterdir():
+        with xr.open_dataset(path) as log:
+            words = json.dumps([path.name, str(log.attrs), *map(str, log.variables)]).lower()
+        assert not [word for word in ("salt", "copy", "flipped", "reversed", "untouched", "mems", "laser", "fog") if word in words]
+    scores = pd.read_csv(tmp_path / "proof" / "scores.csv", keep_default_na=False, na_values=[""])
+    assert sorted(scores["kind"].value_counts().to_dict().items()) == [("control", 6), ("null", 1), ("salted", 2), ("single", 1)]
+    assert set(scores["copy"].dropna()) == {"salted", "untouched", "flipped", "reversed"}
+    counted = proof.table.set_index("quantity")
+    assert counted.loc["false alarms: a name on a null", "n"] == 1  # a copy of a real recording is no null
+    page = (tmp_path / "proof" / "table.md").read_text()
+    assert "| turning the sign brings a name | 0 |" in page
+
+
+def test_a_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
+    said: list[str] = []
+    gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, say=said.append)
+    assert "no real recordings are salted" in said[0]
+    assert "the folder of the real recordings was not given" in (tmp_path / "proof" / "table.md").read_text()
+
+
+def test_real_recordings_that_went_away_before_the_draw(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(core, "_SALTED", 1)
+    with pytest.raises(FormatError, match="nowhere"):
+        gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, real=tmp_path / "nowhere")
+    with pytest.raises(ResumeError, match="say again where they are"):
+        gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
+
+
 def test_wrong_names_on_noise_are_listed():
     truth = {"effects": [], "accepted": [], "plan": {"index": 0, "kind": "null"}, "sampling_rate_hz": 10.0, "seconds": 600.0}
     truth |= {"missing_share": 0.0}
