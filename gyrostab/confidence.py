@@ -18,7 +18,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     """Interval that holds the true Allan variance of each cell.
 
     ``edf * avar / true`` is taken as chi-square with ``edf`` degrees of freedom. Over gaps the true value is the law as
-    seen through them (``white_response``, ``quantization_response``).
+    seen through them (``white_response``, ``quantization_response``, ``ramp_response``).
 
     Parameters
     ----------

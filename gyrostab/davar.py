@@ -91,7 +91,7 @@ def davar(
     Returns
     -------
     xarray.Dataset
-        ``avar, count, coverage, edf, estimator, white_response, quantization_response (axis, time, tau)``,
+        ``avar, count, coverage, edf, estimator, white_response, quantization_response, ramp_response (axis, time, tau)``,
         ``window_mean, window_coverage (axis, time)``, and every channel of the log averaged over each window; ``time`` is
         the centre of the window, with ``time_bounds``; ``tau`` [s]. Units stand on the variables.
 
@@ -224,12 +224,12 @@ def _rows(data: Any, begin: int, end: int) -> Iterator[NDArray[np.generic]]:
 
 
 def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cells (8, n_windows, n_tau), the last field the degrees of freedom, and means (2, n_windows) of one unit."""
+    """Cells (9, n_windows, n_tau), the last field the degrees of freedom, and means (2, n_windows) of one unit."""
     x = np.ascontiguousarray(x)
     cells, means = surface_unit(x, unit)
     scale = HOUR if unit.angle else 1.0  # angles are in degree, so their slopes in degree per second
     cells[0] *= scale**2
-    dof = identify_noise(cells[0], cells[5], cells[6], cells[3], *tables)
+    dof = identify_noise(cells[0], cells[5], cells[6], cells[7], cells[3], *tables)
     means[0] *= scale
     return np.concatenate([cells, dof[None]]), means
 
@@ -256,7 +256,7 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
 
 
 def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
-    """Run the units of work: cells (8, axis, time, tau) and means (2, axis, time), dask if `data` is."""
+    """Run the units of work: cells (9, axis, time, tau) and means (2, axis, time), dask if `data` is."""
     lazy = isinstance(data, da.Array)
     tables = _noise_tables(unit, rate)
     shared = dask.delayed(tables, pure=True, traverse=False) if lazy else tables
@@ -276,7 +276,7 @@ def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
 
 
 def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool) -> tuple[Any, Any]:
-    """The published algorithms, eager: cells (8, axis, time, tau) and means (2, axis, time)."""
+    """The published algorithms, eager: cells (9, axis, time, tau) and means (2, axis, time)."""
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
     n_windows = (all_points - points) // unit.step + (0 if paper else 1)
@@ -296,10 +296,10 @@ def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, pa
         with np.errstate(invalid="ignore", divide="ignore"):
             cells[0, row] = sums / (2.0 * (unit.ks * interval) ** 2 * divisor) * (HOUR**2 if unit.angle else 1.0)
         cells[1, row], cells[2, row] = counts, counts / full
-        cells[3, row], cells[4, row], cells[5:7, row] = counts / full, STRICT, 1.0
+        cells[3, row], cells[4, row], cells[5:8, row] = counts / full, STRICT, 1.0
         if not unit.zero_fill:
             cells[0, row][cells[2, row] < unit.min_coverage] = np.nan
-        cells[7, row] = identify_noise(cells[0, row], cells[5, row], cells[6, row], cells[3, row], *tables)
+        cells[8, row] = identify_noise(cells[0, row], cells[5, row], cells[6, row], cells[7, row], cells[3, row], *tables)
         means[:, row] = window_means(x, unit)[:, :n_windows]
         means[0, row] *= HOUR if unit.angle else 1.0
     return cells, means

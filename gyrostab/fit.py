@@ -48,7 +48,7 @@ def fit_noise(
 
     so they follow from non-negative generalised least squares. The covariance between averaging times (overlapping
     estimates share data) is that of the fitted noise itself, found by iteration. Where gaps forced weighted cluster
-    means, the columns of Q and N are those that the mask predicts.
+    means, the columns of Q, N and R are those that the mask predicts.
 
     Parameters
     ----------
@@ -159,7 +159,9 @@ def _inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, i
     except KeyError as missing:
         raise SchemaError(f"the surface lacks the attribute {missing}; it is not what gyrostab.davar writes") from missing
     ks = np.round(np.asarray(surface["tau"].values) * rate).astype(np.int64)
-    names = ("avar", "white_response", "quantization_response", "gap_factor")
+    if "ramp_response" not in surface:  # of a version that took it as 1
+        surface = surface.assign(ramp_response=xr.ones_like(surface["white_response"]))
+    names = ("avar", "white_response", "quantization_response", "ramp_response", "gap_factor")
     absent = [name for name in names if name not in surface]
     if absent:
         raise SchemaError(f"the surface lacks {absent}, which the fit needs to account for gaps; make it with gyrostab.davar")

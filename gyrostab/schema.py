@@ -72,6 +72,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "long_name": "Allan variance of quantization noise seen through the gaps, as a share of the gap-free law",
         "units": "1",
     },
+    "ramp_response": {"long_name": "Allan variance of a rate ramp seen through the gaps, as a share of the gap-free law", "units": "1"},
     "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
     "window_coverage": {"long_name": "share of the window's samples that are present", "units": "1"},
     "observable": {"long_name": "what the window can tell of the noise term", **_flags(OBSERVABLE)},

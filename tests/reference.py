@@ -79,13 +79,19 @@ def cluster_cell(x: NDArray[np.float64], k: int, *, stride: int = 1, first: int 
         "avar": float(((design @ values) ** 2).sum() / (2 * weight.sum())),
         "white_response": float((design**2).sum() / (2 * weight.sum()) * k),
         "quantization_response": float((angles**2).sum() / (2 * weight.sum()) * k**2 / 3),
+        "ramp_response": float(((design @ np.arange(x.size)) ** 2).sum() / (weight.sum() * k**2)),
         "coverage": float(weight.sum() / (offered * float(k) ** 2)),
         "edf": float(np.trace(pairs) ** 2 / (pairs**2).sum()),
     }
 
 
 def fit_window_plainly(
-    y: NDArray[np.float64], white: NDArray[np.float64], quantization: NDArray[np.float64], factor: NDArray[np.float64], tables: Any
+    y: NDArray[np.float64],
+    white: NDArray[np.float64],
+    quantization: NDArray[np.float64],
+    ramp: NDArray[np.float64],
+    factor: NDArray[np.float64],
+    tables: Any,
 ) -> dict[str, NDArray[np.float64]]:
     """Iterated non-negative generalised least squares of one window with numpy's and scipy's solvers, without any thrift.
 
@@ -93,10 +99,10 @@ def fit_window_plainly(
     term, its growth with the term and with the square of the term; chi-square. `tables` are those of `gyrostab.fit`.
     """
     ok = np.isfinite(y) & (y > 0) & (factor > 0)
-    y, white, quantization, factor = y[ok], white[ok], quantization[ok], factor[ok]
+    y, white, quantization, ramp, factor = y[ok], white[ok], quantization[ok], ramp[ok], factor[ok]
     bare, weight = tables.columns[ok], tables.weight[ok] * factor
     pairs, ramps = tables.pairs[:, :, ok][..., ok], tables.ramps[:, ok][..., ok]
-    design = bare * np.stack([quantization, white, *np.ones((3, y.size))], axis=1)
+    design = bare * np.stack([quantization, white, *np.ones((2, y.size)), ramp], axis=1)
     excess = np.maximum(quantization - 1, 0) * bare[:, 0] / bare[:, 1]
 
     def covariance(s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -105,7 +111,7 @@ def fit_window_plainly(
         roots = np.sqrt(amounts * tables.to_samples[:4, None])
         outer = roots[:, :, None] * roots[:, None, :]
         total = np.einsum("aij,bij,abij->ij", outer, outer, pairs)
-        total += s[4] * tables.to_samples[4] * np.einsum("aij,aij->ij", outer, ramps)
+        total += s[4] * tables.to_samples[4] * np.sqrt(np.multiply.outer(ramp, ramp)) * np.einsum("aij,aij->ij", outer, ramps)
         return total / np.maximum.outer(factor, factor)
 
     def solve(whitener: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -75,7 +75,7 @@ def test_cells_equal_the_sum_over_their_terms(seed, data):
             if not want["count"]:
                 assert np.isnan(cell.avar)
                 continue
-            for name in ("avar", "white_response", "quantization_response", "coverage"):
+            for name in ("avar", "white_response", "quantization_response", "ramp_response", "coverage"):
                 assert float(cell[name]) == pytest.approx(want[name], rel=1e-6 if name == "avar" else 1e-10, abs=1e-12), name
 
 

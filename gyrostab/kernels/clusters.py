@@ -1,8 +1,9 @@
 """Weighted cluster means: the Allan variance of a rate log so full of gaps that few unbroken runs are left.
 
 Each cluster mean uses the samples that are there; a pair of clusters with n1 and n2 samples has weight n1 n2, and both
-must be at least half full. Random walk, flicker and ramp come out right. White and quantization noise come out too high
-by factors that the mask alone determines; those responses are returned, so that a fit can use them as its columns.
+must be at least half full. Random walk and flicker come out right. White and quantization noise come out too high by factors
+that the mask alone determines, and so does a ramp, slightly, as lost samples move the centres of the clusters; those responses are
+returned, so that a fit can use them as its columns.
 
 What a pair of clusters adds does not depend on the window, so it is summed in blocks as the other terms are (see
 `gyrostab.kernels.blocks`). Samples and runs are counted in a mask of one bit a sample, which stays in the cache.
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.blocks import windows_from_blocks
 from gyrostab.kernels.compiled import INNER
 
-__all__ = ["cluster_cells", "cluster_factor", "cluster_strides", "pack_mask"]
+__all__ = ["cluster_cells", "cluster_factor", "cluster_strides", "integrate_places", "pack_mask"]
 
 # Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -79,10 +80,25 @@ def _before(mask, m):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _add_pairs(theta, mask, a, b, k, stride, row):  # type: ignore[no-untyped-def]
+def integrate_places(starts, stops, n):  # type: ignore[no-untyped-def]
+    """Integral of a ramp of one a sample over the present samples, as `theta` of the rate in `cluster_cells`; exact up to 2^26 samples."""
+    out = np.empty(n + 1)
+    total, at = 0.0, np.int64(0)
+    for r in range(starts.size):
+        out[at : starts[r] + 1] = total
+        for i in range(starts[r], stops[r]):
+            total += i
+            out[i + 1] = total
+        at = stops[r] + 1
+    out[at:] = total
+    return out
+
+
+@njit(**INNER)
+def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-untyped-def]
     """Add to `row` over the pairs of clusters that begin in ``a <= m < b``: weight d^2, weight, what makes the responses, number."""
     one = np.int64(1)
-    squares = weights = white = quantization = 0.0
+    squares = weights = white = quantization = ramp = 0.0
     count = 0
     for m in range((a + stride - 1) // stride * stride, b, stride):
         row0, row1, row2 = np.uint64(m >> 6), np.uint64((m + k) >> 6), np.uint64((m + 2 * k) >> 6)
@@ -95,6 +111,7 @@ def _add_pairs(theta, mask, a, b, k, stride, row):  # type: ignore[no-untyped-de
         f1, f2 = float(n1), float(n2)
         at0, at1, at2 = np.uint64(m), np.uint64(m + k), np.uint64(m + 2 * k)
         d = (theta[at2] - theta[at1]) * f1 - (theta[at1] - theta[at0]) * f2  # n1 n2 times the difference of the means
+        apart = (places[at2] - places[at1]) * f1 - (places[at1] - places[at0]) * f2  # and that of their centres
         # a run that a cluster cuts counts in both
         runs = mask[row1, 3] + _ones(mask[row1, 1] & low1)
         cut0, cut1 = mask[row0, 0] & ~mask[row0, 1] & (low0 + one) != 0, mask[row1, 0] & ~mask[row1, 1] & (low1 + one) != 0
@@ -102,6 +119,7 @@ def _add_pairs(theta, mask, a, b, k, stride, row):  # type: ignore[no-untyped-de
         r2 = mask[row2, 3] + _ones(mask[row2, 1] & low2) - runs + cut1
         inverse = 1.0 / (f1 * f2)
         squares += d * d * inverse
+        ramp += apart * apart * inverse
         weights += f1 * f2
         white += f1 + f2
         quantization += 2.0 * (r1 * f2 * f2 + r2 * f1 * f1) * inverse + 2.0 * cut1
@@ -111,16 +129,19 @@ def _add_pairs(theta, mask, a, b, k, stride, row):  # type: ignore[no-untyped-de
     row[2] += white
     row[3] += quantization
     row[4] += count
+    row[5] += ramp
 
 
 @njit(**INNER)
-def cluster_cells(theta, mask, window, step, k, stride, poor):  # type: ignore[no-untyped-def]
+def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: ignore[no-untyped-def]
     """Cells of the `poor` windows of one averaging factor by weighted cluster means.
 
     Parameters
     ----------
     theta : float64 (n + 1,)
         Integral of the rate over present samples, gaps adding nothing.
+    places : float64 (n + 1,)
+        As from `integrate_places`.
     mask
         As from `pack_mask`.
     window, step, k, stride : int
@@ -130,27 +151,27 @@ def cluster_cells(theta, mask, window, step, k, stride, poor):  # type: ignore[n
 
     Returns
     -------
-    float64 (n_windows, 5)
+    float64 (n_windows, 6)
         Weighted mean of ``(mean2 - mean1)^2 / 2`` [square of the rate's unit]; responses to unit white and quantization
         noise, relative to the gap-free laws; weight used, as a share of the gap-free weight; number of pairs used, 0 where
-        there are none or the window is not wanted.
+        there are none or the window is not wanted; response to a ramp.
     """
     length = window - 2 * k + 1
     whole = length // step
     head = length - whole * step
     n_windows = poor.size
-    heads, tails = np.zeros((n_windows + whole, 5)), np.zeros((n_windows + whole, 5))
+    heads, tails = np.zeros((n_windows + whole, 6)), np.zeros((n_windows + whole, 6))
     last = -1
     for j in range(n_windows):
         if poor[j]:
             for block in range(max(last + 1, j), j + whole + 1):
                 a = block * step
-                _add_pairs(theta, mask, a, a + head, k, stride, heads[block])
+                _add_pairs(theta, places, mask, a, a + head, k, stride, heads[block])
                 if block < n_windows + whole - 1:
-                    _add_pairs(theta, mask, a + head, a + step, k, stride, tails[block])
+                    _add_pairs(theta, places, mask, a + head, a + step, k, stride, tails[block])
             last = j + whole
-    sums = windows_from_blocks(heads, tails, np.full(5, whole), n_windows)
-    out = np.zeros((n_windows, 5))
+    sums = windows_from_blocks(heads, tails, np.full(6, whole), n_windows)
+    out = np.zeros((n_windows, 6))
     for j in range(n_windows):
         if poor[j] and sums[j, 4] > 0.0:
             offered = (j * step + length + stride - 1) // stride - (j * step + stride - 1) // stride
@@ -159,6 +180,7 @@ def cluster_cells(theta, mask, window, step, k, stride, poor):  # type: ignore[n
             out[j, 2] = sums[j, 3] / (2.0 * sums[j, 1]) * k * k / 3.0
             out[j, 3] = sums[j, 1] / (offered * float(k) * k)
             out[j, 4] = sums[j, 4]
+            out[j, 5] = sums[j, 5] / (sums[j, 1] * float(k) * k)
     return out
 
 

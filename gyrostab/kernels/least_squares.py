@@ -54,12 +54,12 @@ def _quick(system, weight, factor, normal, right, allowed, squares):  # type: ig
 
 
 @njit(**KERNEL)
-def identify_noise(avar, white, quantization, factor, columns, weight, to_samples, pairs, ramps):  # type: ignore[no-untyped-def]
+def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_samples, pairs, ramps):  # type: ignore[no-untyped-def]
     """Degrees of freedom of each cell with the noise mixture identified by a quick fit of the window.
 
     Parameters
     ----------
-    avar, white, quantization, factor : float64 (n_windows, n_tau)
+    avar, white, quantization, ramp, factor : float64 (n_windows, n_tau)
         Cells and what the gaps do to them.
     columns : float64 (n_tau, 5)
         Allan variance per squared coefficient.
@@ -87,9 +87,9 @@ def identify_noise(avar, white, quantization, factor, columns, weight, to_sample
     system, seen, inverse = np.empty((n_tau, LANES)), np.empty((6, n_tau)), np.empty(n_tau)
     normal, right = np.empty((5, 5)), np.empty(5)
     for w in range(avar.shape[0]):
-        if observe(avar[w], white[w], quantization[w], factor[w], columns, to_samples, system, seen, inverse):
+        if observe(avar[w], white[w], quantization[w], ramp[w], factor[w], columns, to_samples, system, seen, inverse):
             _quick(system, weight, factor[w], normal, right, np.int64(31), squares)
-            degrees_of_freedom(squares, avar[w], white[w], quantization[w], factor[w], columns, to_samples, diagonal, out[w])
+            degrees_of_freedom(squares, avar[w], white[w], quantization[w], ramp[w], factor[w], columns, to_samples, diagonal, out[w])
             for i in range(n_tau):
                 if system[i, DATA] == 0.0:
                     out[w, i] = np.nan
@@ -258,12 +258,12 @@ def _judge(chosen, allowed, squares, system, seen, inverse, tables, root, whole,
 
 
 @njit(**KERNEL)
-def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pairs, ramps, weight, allowed):  # type: ignore[no-untyped-def]
+def fit_windows(avar, white, quantization, ramp, gap_factor, columns, to_samples, pairs, ramps, weight, allowed):  # type: ignore[no-untyped-def]
     """Fit every window.
 
     Parameters
     ----------
-    avar, white, quantization, gap_factor : float64 (n_windows, n_tau)
+    avar, white, quantization, ramp, gap_factor : float64 (n_windows, n_tau)
         Cells [degree2 hour-2], NaN where there is none, and what the gaps do to them.
     columns : float64 (n_tau, 5)
         Allan variance per squared coefficient.
@@ -302,7 +302,7 @@ def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pair
     seen, root, inverse, work = np.empty((6, size)), np.empty((5, size)), np.empty(size), np.empty((2, size))
     normal, right, squares = np.empty((5, 5)), np.empty(5), np.empty(5)
     for w in range(n_windows):
-        n = observe(avar[w], white[w], quantization[w], gap_factor[w], columns, to_samples, system, seen, inverse)
+        n = observe(avar[w], white[w], quantization[w], ramp[w], gap_factor[w], columns, to_samples, system, seen, inverse)
         misfit[w, 1] = 0.0
         if n == 0:
             continue
@@ -317,5 +317,5 @@ def fit_windows(avar, white, quantization, gap_factor, columns, to_samples, pair
         for a in range(5):
             misfit[w, 1] -= (chosen & allowed) >> a & 1
             squares[a] = result[w, 0, a] if np.isfinite(result[w, 0, a]) else 0.0
-        degrees_of_freedom(squares, avar[w], white[w], quantization[w], gap_factor[w], columns, to_samples, diagonal, dof[w])
+        degrees_of_freedom(squares, avar[w], white[w], quantization[w], ramp[w], gap_factor[w], columns, to_samples, diagonal, dof[w])
     return result, misfit, dof

@@ -48,25 +48,25 @@ def interpolate_quantile(freedom, start, step, curve):  # type: ignore[no-untype
 
 
 @njit(**INNER)
-def _see(columns, white, quantization, squares, seen):  # type: ignore[no-untyped-def]
+def _see(columns, white, quantization, ramp, squares, seen):  # type: ignore[no-untyped-def]
     """Allan variance of one cell under the fitted model; per squared coefficient, seen through the gaps, to `seen`."""
     model = 0.0
     for a in range(5):
-        seen[a] = columns[a] * (quantization if a == 0 else (white if a == 1 else 1.0))
+        seen[a] = columns[a] * (quantization if a == 0 else white if a == 1 else ramp if a == 4 else 1.0)
         if squares[a] > 0.0:
             model += seen[a] * squares[a]
     return model
 
 
 @njit(**KERNEL)
-def cell_limits(avar, white, quantization, factor, squares, dof, columns, own_dof, ks, span, most, start, step, curve):  # type: ignore[no-untyped-def]
+def cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, own_dof, ks, span, most, start, step, curve):  # type: ignore[no-untyped-def]
     """Upper limit of each squared coefficient from one cell, which cannot be less than the term's own part of it.
 
     The cell is the one where the fitted model promises the lowest limit, so that its own scatter does not choose it.
 
     Parameters
     ----------
-    avar, white, quantization, factor, dof : float64 (n_windows, n_tau)
+    avar, white, quantization, ramp, factor, dof : float64 (n_windows, n_tau)
         Cells, what the gaps do to them, and their degrees of freedom under the fitted noise.
     squares : float64 (n_windows, 5)
         Fitted squared coefficients; NaN counts as zero.
@@ -102,7 +102,7 @@ def cell_limits(avar, white, quantization, factor, squares, dof, columns, own_do
         for i in range(n_tau):
             if not np.isfinite(avar[w, i]):
                 continue
-            model = _see(columns[i], white[w, i], quantization[w, i], squares[w], seen)
+            model = _see(columns[i], white[w, i], quantization[w, i], ramp[w, i], squares[w], seen)
             share = factor[w, i]
             for a in range(5):
                 if ks[i] * span[a] < ks[last]:

@@ -46,7 +46,7 @@ def combine_products(pairs, ramps, tables):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def observe(avar, white, quantization, factor, columns, to_samples, system, seen, inverse):  # type: ignore[no-untyped-def]
+def observe(avar, white, quantization, ramp, factor, columns, to_samples, system, seen, inverse):  # type: ignore[no-untyped-def]
     """Describe the cells of a window; returns how many are valid.
 
     Design matrix and data go to `system`; what a unit of each squared coefficient is in sample units, as the cell sees it
@@ -65,13 +65,14 @@ def observe(avar, white, quantization, factor, columns, to_samples, system, seen
             system[i, a] = columns[i, a]
         system[i, 0] *= quantization[i]
         system[i, 1] *= white[i]
+        system[i, 4] *= ramp[i]
         system[i, DATA] = avar[i]
         seen[0, i] = min(quantization[i], 1.0) * to_samples[0]
         seen[1, i] = white[i] * to_samples[1]
         seen[2, i] = max(quantization[i] - 1.0, 0.0) * columns[i, 0] / columns[i, 1] * to_samples[1]
         seen[3, i] = to_samples[2]
         seen[4, i] = to_samples[3]
-        seen[5, i] = to_samples[4]
+        seen[5, i] = ramp[i] * to_samples[4]
         inverse[i] = 1.0 / factor[i]
     return n
 
@@ -135,7 +136,7 @@ def variance_parts(root, term, inverse, tables, weights, part, out):  # type: ig
 
 
 @njit(**INNER)
-def degrees_of_freedom(squares, avar, white, quantization, factor, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
+def degrees_of_freedom(squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
     """Equivalent degrees of freedom of each finite cell under a mixture of noises, ``2 mean^2 / variance``."""
     amounts = np.empty(5)
     for i in range(avar.size):
@@ -143,8 +144,9 @@ def degrees_of_freedom(squares, avar, white, quantization, factor, columns, to_s
             continue
         mean = squares[0] * quantization[i] * columns[i, 0] + squares[1] * white[i] * columns[i, 1]
         for a in range(2, 5):
-            mean += squares[a] * columns[i, a]
-            amounts[a] = squares[a] * to_samples[a]
+            share = ramp[i] if a == 4 else 1.0
+            mean += squares[a] * share * columns[i, a]
+            amounts[a] = squares[a] * share * to_samples[a]
         excess = max(quantization[i] - 1.0, 0.0) * columns[i, 0] / columns[i, 1]
         amounts[0] = squares[0] * min(quantization[i], 1.0) * to_samples[0]
         amounts[1] = (squares[1] * white[i] + squares[0] * excess) * to_samples[1]

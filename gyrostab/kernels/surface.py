@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.blocks import full_counts, grouped_blocks, groups, windows_from_blocks
-from gyrostab.kernels.clusters import cluster_cells, cluster_factor, cluster_strides, pack_mask
+from gyrostab.kernels.clusters import cluster_cells, cluster_factor, cluster_strides, integrate_places, pack_mask
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.integrate import (
     block_sums,
@@ -28,7 +28,7 @@ __all__ = ["CELL_FIELDS", "NONE", "STRICT", "WEIGHTED", "Unit", "surface_unit", 
 
 NONE, STRICT, WEIGHTED = 0, 1, 2
 #: Order of the fields of a cell in the array that `surface_unit` returns.
-CELL_FIELDS = ("avar", "count", "coverage", "gap_factor", "estimator", "white_response", "quantization_response")
+CELL_FIELDS = ("avar", "count", "coverage", "gap_factor", "estimator", "white_response", "quantization_response", "ramp_response")
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -82,6 +82,7 @@ def _fill(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[n
             cells[4, j, i] = STRICT
             cells[5, j, i] = 1.0
             cells[6, j, i] = 1.0
+            cells[7, j, i] = 1.0
 
 
 @njit(**KERNEL)
@@ -102,10 +103,11 @@ def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, ce
 def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells):  # type: ignore[no-untyped-def]
     """Weighted clusters where too few terms are left (rate logs only)."""
     mask = pack_mask(starts, stops, theta.size - 1)
+    places = integrate_places(starts, stops, theta.size - 1)
     for i in range(ks.size):
         if not poor[:, i].any():
             continue
-        bridged = cluster_cells(theta, mask, window, step, ks[i], strides[i], poor[:, i])
+        bridged = cluster_cells(theta, places, mask, window, step, ks[i], strides[i], poor[:, i])
         for j in range(poor.shape[0]):
             if poor[j, i]:
                 found = bridged[j, 4] > 0.0
@@ -116,6 +118,7 @@ def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells): 
                 cells[4, j, i] = WEIGHTED
                 cells[5, j, i] = bridged[j, 1]
                 cells[6, j, i] = bridged[j, 2]
+                cells[7, j, i] = bridged[j, 5]
 
 
 class _Angle(NamedTuple):
@@ -190,7 +193,7 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
 
     Returns
     -------
-    cells : ndarray (7, n_windows, n_tau)
+    cells : ndarray (8, n_windows, n_tau)
         The fields of `CELL_FIELDS`; the variance is in the square of the rate's unit (for angles: of angle per second).
     means : ndarray (2, n_windows)
         As `window_means`.
@@ -218,7 +221,7 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
             _bridge_gaps(angle.flat[: angle.points], starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
     if gaps and not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
-        cells[0][blank] = cells[5][blank] = cells[6][blank] = np.nan
+        cells[0][blank] = cells[5][blank] = cells[6][blank] = cells[7][blank] = np.nan
         cells[4][blank] = NONE
         cells[3][blank] = 0.0
     return cells, means

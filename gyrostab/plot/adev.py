@@ -123,7 +123,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, colours: list[str]) -> None:
     """Draw each observed term as a broken line, name the limits of the others, and draw the sum of all five as a black line."""
     tau = window["tau"].values
     total = np.zeros(tau.size)
-    responses = {"N": "white_response", "Q": "quantization_response"}
+    responses = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
     for number, (symbol, law) in enumerate(LAWS.items()):
         state = int(window["observable"].sel(term=symbol))
         value, error, upper = (float(window[f"{symbol}{end}"]) for end in ("", "_stderr", "_upper"))
