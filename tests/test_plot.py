@@ -283,3 +283,16 @@ def test_figures_leave_pyplot_alone(product):
     plot_davar(product)
     plot_coefficients(product)
     assert plt.get_fignums() == []
+
+
+def test_a_variance_below_zero_has_no_deviation(product):
+    """The recursion as printed drifts there where there is next to no noise; no root is taken of it, and the cell stays blank."""
+    spoiled = product.copy(deep=True)
+    cell = {"axis": "x", "time": product.time[3], "tau": product.tau[2]}
+    assert np.isfinite(product.avar.sel(cell))
+    spoiled["avar"].loc[cell] = -1e-18
+    before, after = (
+        next(np.ma.filled(item.get_array(), np.nan) for item in plot_davar(one, axis="x").axes[0].collections if isinstance(item, QuadMesh))
+        for one in (product, spoiled)
+    )
+    assert np.isnan(after).sum() == np.isnan(before).sum() + 1

@@ -158,7 +158,8 @@ def _columns(product: xr.Dataset, names: list[str], columns: int) -> tuple[list[
         weighted = np.logical_or.reduceat(part["estimator"].values == _WEIGHTED, edges, axis=0)
         number = np.add.reduceat(np.isfinite(avar).astype(float), edges, axis=0)
         total = np.add.reduceat(np.nan_to_num(avar, nan=0.0), edges, axis=0)
-        mean = np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
+        known = (number > 0) & (total >= 0.0)  # the recursion as printed drifts below zero where there is next to no noise
+        mean = np.divide(total, number, out=np.full_like(total, np.nan), where=known)
         cells.append((np.sqrt(mean), weighted & np.isfinite(mean)))
     return cells, merged
 
