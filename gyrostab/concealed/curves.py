@@ -18,6 +18,8 @@ Row = Mapping[str, Any]
 def curves(rows: Sequence[Row]) -> pd.DataFrame:
     """Completeness against strength: shares detected and named, of every effect and of all, with Wilson's intervals.
 
+    Of an effect of no catalogue it is right to say that it is unknown, so this counts there in the place of a name.
+
     Returns
     -------
     pandas.DataFrame
@@ -36,7 +38,7 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
                 continue
             line: dict[str, Any] = {"effect": effect, "strength": strength, "n": len(part)}
             for key in ("detected", "named"):
-                hits = sum(bool(row[key]) for row in part)
+                hits = sum(bool(row["unknown" if key == "named" and row["kind"] == "strange" else key]) for row in part)
                 low, high = wilson(hits, len(part))
                 line |= {key: hits / len(part), f"{key}_low": low, f"{key}_high": high}
             out.append(line)

@@ -152,7 +152,7 @@ def _turning(world: World) -> NDArray[np.bool_]:
 def earth_rate(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """What is left of the earth's rate on the two turning axes, a quarter of a turn apart."""
     x, y = tool.cross_axis(_angle(world, rng), across=1.0)
-    return mean_effect(
+    effect = mean_effect(
         world,
         np.stack([x, y, np.zeros_like(x)]),
         np.array([1.0, 1.0, 0.0]),
@@ -164,6 +164,10 @@ def earth_rate(world: World, rng: np.random.Generator, *, strength: float) -> Ef
         tau=_turn_tau(world),
         active=_turning(world),
     )
+    across = float(effect.parameters["peak"]["value"])  # the earth's rate across the tool, of 15.041 deg/h at most
+    if across < tool.EARTH_RATE:
+        effect.parameters["latitude"] = {"value": math.degrees(math.acos(across / tool.EARTH_RATE)), "unit": "deg"}
+    return effect
 
 
 def rotation_line(world: World, rng: np.random.Generator, *, strength: float) -> Effect:

@@ -14,10 +14,15 @@ if TYPE_CHECKING:
 __all__ = ["draw_completeness", "draw_reliability"]
 
 _ACROSS = 5
+_POOLS = (1.5, 4.0)  # below the first: too faint to be asked for
+_LABELS = {"detected": "detected", "named": "named rightly (called unknown, where no catalogue holds it)"}
 
 
 def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
-    """Prepare a panel for each effect: shares detected and named against strength, with Wilson's intervals."""
+    """Prepare a panel for each effect: shares detected and named against strength, with Wilson's intervals.
+
+    One effect has few cases of each strength, so those of like strength are pooled; the first panel is of all.
+    """
     from gyrostab.plot.style import new_figure, save_png
 
     names = list(dict.fromkeys(curves["effect"])) if len(curves) else []
@@ -26,7 +31,8 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
     panels: Any = figure.subplots(down, _ACROSS, sharex=True, sharey=True, squeeze=False)
     for place, panel in enumerate(panels.flat):
         if place < len(names):
-            _panel(panel, curves[curves["effect"] == names[place]], names[place].replace("_", " "))
+            part = curves[curves["effect"] == names[place]]
+            _panel(panel, part if names[place] == "all" else _pooled(part), names[place].replace("_", " "))
         else:
             panel.set_axis_off()
     figure.supxlabel("strength, in units of the closed-form limit")
@@ -34,6 +40,25 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
     if names:
         figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     return lambda target: save_png(figure, target, colours=64)
+
+
+def _pooled(part: pd.DataFrame) -> pd.DataFrame:
+    """The same with few strengths: each the (geometric) middle of those from one limit to the next, weighted by their cases."""
+    import numpy as np
+    import pandas as pd
+
+    from gyrostab.concealed.shares import wilson
+
+    out = []
+    for _, group in part.groupby(np.digitize(part["strength"], _POOLS)):
+        number = int(group["n"].sum())
+        line: dict[str, Any] = {"strength": float(np.exp(np.average(np.log(group["strength"]), weights=group["n"]))), "n": number}
+        for key in ("detected", "named"):
+            hits = round(float((group[key] * group["n"]).sum()))
+            low, high = wilson(hits, number)
+            line |= {key: hits / number, f"{key}_low": low, f"{key}_high": high}
+        out.append(line)
+    return pd.DataFrame(out)
 
 
 def _panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
@@ -51,7 +76,7 @@ def _panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
             markersize=4,
             linewidth=1.2,
             elinewidth=0.7,
-            label=key,
+            label=_LABELS[key],
         )
     panel.set_title(f"{title} ({int(part['n'].sum())})", fontsize="small")
     panel.set_xscale("log", base=2)
@@ -71,7 +96,7 @@ def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
         panel.barh(place, claim["right"], color=COLOURS[2], height=0.6)
         panel.plot([claim["low"], claim["high"]], [place, place], color="black", linewidth=1.0)
     panel.set_yticks(range(len(claims)), [f"{claim['name'].replace('_', ' ')} ({claim['n']})" for claim in claims])
-    panel.invert_yaxis()
+    panel.set_ylim(max(len(claims), 1) - 0.4, -0.6)
     panel.set_xlim(0, 1)
-    panel.set_xlabel("share of the claims that are right, with 95 % interval")
+    panel.set_xlabel("share of the claims that are right, with 95 % interval (how often claimed)")
     return lambda target: save_png(figure, target, colours=64)
