@@ -47,8 +47,7 @@ def illustrate(page):
         name = part[3:].split("\n", 1)[0].strip()
         if part.startswith("## ") and name in PLAN:
             if "<!-- figure -->" not in part:
-                tail = "\n" if number + 1 < len(parts) else ""
-                part = part.rstrip("\n") + "\n\n<!-- figure -->\n<!-- end of figure -->\n" + tail
+                part = part.rstrip("\n") + "\n\n<!-- figure -->\n<!-- end of figure -->\n" + "\n" * (number + 1 < len(parts))
             image = f"![{effects()[name].short}](../figures/effects/{name}.png)\n\n{PLAN[name]['caption']}\n"
             parts[number] = between(part, "figure", image)
     page.write_text("".join(parts), encoding="utf-8")
