@@ -32,6 +32,13 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     xarray.Dataset
         ``avar_lower, avar_upper (axis, time, tau)`` [degree2 hour-2]; NaN where there is no estimate; dask if `surface` is.
 
+    Raises
+    ------
+    SchemaError
+        When it is no surface.
+    OptionError
+        When `level` is no probability.
+
     References
     ----------
     IEEE Std 1139-2008, annex; Greenhall and Riley, PTTI 2003.

@@ -257,17 +257,93 @@ def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
 
 
 def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Open a product (surface with coefficients); as `open_dataset`, and `FormatError` when the file holds something else."""
+    """Open a product: a dynamic Allan variance with the coefficients of every window.
+
+    Parameters
+    ----------
+    path : path-like
+        NetCDF file or Zarr directory that ``gyrostab run``, ``gyrostab fit``, `to_netcdf` or `to_zarr` wrote.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``avar(axis, time, tau)`` [degree2 hour-2], ``Q, N, B, K, R (axis, time)`` with errors and limits, and the rest of
+        ``docs/product.md``; data stays on disk (dask) until it is used.
+
+    Raises
+    ------
+    FormatError
+        When there is no such file, when it is damaged, or when it holds something else.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from gyrostab.davar import davar
+    >>> from gyrostab.fit import fit_noise
+    >>> from gyrostab.log import make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = to_netcdf(fit_noise(davar(log, window="60s")), folder + "/product.nc")
+    ...     with open_product(folder + "/product.nc") as product:
+    ...         print(product.N.dims, product.N.unit_label)
+    ('axis', 'time') deg/sqrt(h)
+    """
     return _open(path, "a product", check_product, "make one with 'gyrostab run' or 'gyrostab fit'")
 
 
 def open_surface(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Open a DAVAR surface, or a product, which holds one; as `open_dataset`, and `FormatError` when it holds something else."""
+    """Open a dynamic Allan variance without coefficients, or a product, which holds one.
+
+    Parameters
+    ----------
+    path : path-like
+        NetCDF file or Zarr directory that ``gyrostab davar``, `to_netcdf` or `to_zarr` wrote, or a product.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``avar(axis, time, tau)`` [degree2 hour-2] with ``count``, ``coverage`` and ``edf``; data stays on disk (dask) until it is used.
+
+    Raises
+    ------
+    FormatError
+        When there is no such file, when it is damaged, or when it holds something else.
+    """
     return _open(path, "a DAVAR surface", check_surface, "make one with 'gyrostab davar'")
 
 
 def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
-    """Open a regular log; as `open_dataset`, and `FormatError` when the file holds something else."""
+    """Open a regular log.
+
+    Parameters
+    ----------
+    path : path-like
+        NetCDF file or Zarr directory that ``gyrostab ingest``, ``gyrostab simulate``, `to_netcdf` or `to_zarr` wrote.
+    strict : bool
+        Raise `FormatError` where a chunk that is read turns out to be damaged or missing; by default it becomes a gap, of
+        which a warning tells the file, the axis and the times.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``rate(axis, time)`` [degree hour-1] or ``angle`` [degree], NaN where a sample is missing, with the channels and the
+        table of gaps; data stays on disk (dask, the chunks of the file) until it is used.
+
+    Raises
+    ------
+    FormatError
+        When there is no such file, when it is damaged, or when it holds something else.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from gyrostab.log import make_log
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = to_netcdf(make_log([[1.0, np.nan, 2.0]], rate=100.0, unit="deg/h"), folder + "/log.nc")
+    ...     with open_log(folder + "/log.nc") as log:
+    ...         print(log.rate.values)
+    [[ 1. nan  2.]]
+    """
     return _open(path, "a regular log", check_log, "make one with 'gyrostab ingest'", strict=strict)
 
 

@@ -90,6 +90,18 @@ class Model:
 def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     """Read a model from a TOML file or from the same tables as a dict.
 
+    Parameters
+    ----------
+    model : path-like or mapping
+        The file, or its tables ``log``, ``noise``, ``environment`` and ``effect`` as in ``docs/simulate.md``. Numbers are in the
+        units of the coefficients (Q [urad], N [deg/sqrt(h)], B [deg/h], K [deg/h^1.5], R [deg/h^2]) and of the parameters of the
+        effects; text carries a unit of its own.
+
+    Returns
+    -------
+    Model
+        What `gyrostab.simulate` takes, with all numbers in those units.
+
     Raises
     ------
     FormatError
