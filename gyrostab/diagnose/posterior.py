@@ -119,17 +119,17 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
     width = fit.columns.shape[1]
     square, normal = np.zeros(width), np.zeros((width, width))
     square[1] = max(float((fit.weight * fit.rest() / fit.columns[:, 1]).sum() / fit.weight.sum()), 0.0)
-    spectrum = fit.columns @ square if fit.start is None else fit.start
+    spectrum = np.asarray(fit.columns @ square if fit.start is None else fit.start, dtype=np.float64)
     beside, precision = fit.free()
     for _ in range(50):
         weight = fit.weight / spectrum**2
         normal, right, to_noise, to_right = _without(beside, precision, fit.columns, fit.rest(), weight)
         found = np.empty(width)
         solve_nonnegative(normal, right, (1 << width) - 1, found, 0)
-        after = fit.columns @ np.maximum(found, 0.0)
+        after = np.asarray(fit.columns @ np.maximum(found, 0.0), dtype=np.float64)
         if beside.shape[1] or fit.known is not None:
             after = after + (fit.power - fit.rest()) + beside @ (to_right - to_noise @ np.maximum(found, 0.0))
-            after = np.maximum(after, _LEAST * spectrum)
+            after = np.asarray(np.maximum(after, _LEAST * spectrum))
         if not (after > 0.0).all():
             break
         square = np.maximum(found, 0.0)
@@ -137,7 +137,7 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
         spectrum = after
         if change < 1e-9:
             break
-    return square, normal, spectrum
+    return square, np.asarray(normal, dtype=np.float64), spectrum
 
 
 def _without(beside: Array, precision: Array, columns: Array, power: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
@@ -149,7 +149,8 @@ def _without(beside: Array, precision: Array, columns: Array, power: Array, weig
     inner = (beside.T * weight) @ beside + np.diag(precision)
     inner += 1e-9 * np.diag(np.maximum(np.diagonal(inner), 1e-300))
     crossed = weighted @ beside
-    to_noise, to_right = np.linalg.solve(inner, crossed.T), np.linalg.solve(inner, (beside.T * weight) @ power)
+    to_noise = np.asarray(np.linalg.solve(inner, crossed.T), dtype=np.float64)
+    to_right = np.asarray(np.linalg.solve(inner, (beside.T * weight) @ power), dtype=np.float64)
     return normal - crossed @ to_noise, right - crossed @ to_right, to_noise, to_right
 
 

@@ -16,7 +16,7 @@ from gyrostab.diagnose.claims import Naming
 from gyrostab.diagnose.expected import common_variance, noise_powers, white_variance
 from gyrostab.diagnose.explained import Part, explain_away, take_part
 from gyrostab.diagnose.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior
-from gyrostab.diagnose.refit import Fitted
+from gyrostab.diagnose.refit import FORM_ERROR, Fitted
 from gyrostab.diagnose.response import is_filter, response_of
 from gyrostab.diagnose.sizes import part_mixture
 from gyrostab.physics.base import Effect
@@ -28,7 +28,6 @@ Array = NDArray[np.float64]
 _GROUPS = 150  # of blocks of like level, over which powers are averaged
 _LEAST = 24  # blocks
 _BLURRED = 1e-4  # share of its information that N must keep beside the effects
-_FORM = 0.3  # error of a power that an effect is only said to have, as a share of it
 #: Parts whose power comes from what the effect says of itself, since their own view does not hold it.
 _SAID = ("cross", "marks")
 
@@ -46,12 +45,15 @@ class _Seen:
     response : ndarray, shape (band,)
         Factor of the noise.
     means : list of ndarray, shape (block,)
+    doubt : float
+        Error of `known`, as a share of it.
     """
 
     known: Array
     response: Array
     free: list[Array] = field(default_factory=list)
     means: list[Array] = field(default_factory=list)
+    doubt: float = 2.0 * FORM_ERROR
 
 
 def recalibrate(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], known: NDArray[np.bool_] | None = None) -> xr.Dataset:
@@ -138,9 +140,11 @@ def _seen(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: 
         touched |= bool(parts)
         for part in parts:
             _add(out, part, naming, baseline, axis)
-        effect = next((one.effect for one in fitted if one.claim is claim and axis in one.axes), None)
-        if effect is not None and any(part.candidate.view in _SAID for part in parts):
+        numbers = next((one for one in fitted if one.claim is claim and axis in one.axes), None)
+        effect = None if numbers is None else numbers.effect
+        if numbers is not None and effect is not None and any(part.candidate.view in _SAID for part in parts):
             out.known += _said(effect, reduced, axis)
+            out.doubt = max([out.doubt, *(2.0 * one.stderr / abs(one.value) for one in numbers.parameters.values() if one.value)])
         if effect is not None and any(is_filter(part.candidate.view, part.variant) for part in parts):
             out.response = out.response * response_of(effect, reduced)
     return out if touched else None
@@ -267,7 +271,7 @@ def _fit(power: Array, shape: Array, columns: Array, expected: Array, seen: _See
     known = flat[2][:, None]
     precision = np.zeros(beside.shape[1])
     if np.any(known > 0.0):  # what an effect is said to have is not known better than so
-        beside, precision = np.concatenate([beside, known], axis=1), np.append(precision, 1.0 / _FORM**2)
+        beside, precision = np.concatenate([beside, known], axis=1), np.append(precision, 1.0 / seen.doubt**2)
     return Fit(flat[0], flat[1], weight[some], known=flat[2], beside=beside, precision=precision, start=flat[3])
 
 

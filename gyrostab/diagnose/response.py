@@ -48,5 +48,6 @@ def straightened(reduced: xr.Dataset, axis: str, effect: str, values: Mapping[st
     if axis in done:
         return reduced, stopped
     here = reduced["axis"] == axis
-    factor = xr.where(here, xr.DataArray(1.0 / np.maximum(response, _STOPPED * response.max()), dims="line"), 1.0)
-    return reduced.assign(line_power=reduced["line_power"] * factor).assign_attrs(straightened=" ".join([*done, axis])), stopped
+    factor = xr.DataArray(np.maximum(response, _STOPPED * response.max()), dims="line")
+    power = reduced["line_power"]
+    return reduced.assign(line_power=power.where(~here, power / factor)).assign_attrs(straightened=" ".join([*done, axis])), stopped

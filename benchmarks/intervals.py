@@ -1,0 +1,86 @@
+"""How often the 95 % intervals of a diagnosis hold the truth: fits of many records whose statistics are drawn from their laws.
+
+    python benchmarks/intervals.py [RECORDS]
+
+Every record is an hour of a good gyro, three axes at 10 Hz: its block statistics are those of noise, to which an effect is added; the fit
+knows the effect, not its size, and has the noise free. "Wrong" forms are those that a fit cannot reproduce.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from gyrostab.diagnose.baseline import calibrate  # noqa: E402
+from gyrostab.diagnose.candidates import effect_candidates  # noqa: E402
+from gyrostab.diagnose.cells import begin_state  # noqa: E402
+from gyrostab.diagnose.claims import Claim, Naming  # noqa: E402
+from gyrostab.diagnose.ensemble import null_records  # noqa: E402
+from gyrostab.diagnose.explained import Part, explain_away  # noqa: E402
+from gyrostab.diagnose.folds import fold_blocks  # noqa: E402
+from gyrostab.diagnose.refit import fit_claims  # noqa: E402
+from tests.named import COEFFICIENT, record  # noqa: E402
+
+
+def frames(reduced, baseline, effect, view, column):
+    """A naming of the effect on x, with the usual values of its other parameters."""
+    known, reasons = effect_candidates(reduced, COEFFICIENT)
+    one = next(one for one in known if one.effect == effect and one.view == view)
+    variant = next(variant for variant in one.variants if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0)
+    claim = Claim(effect, one.driver, ("x",), (Part(one, variant, ("x",), 50.0),), 50.0, 8.0)
+    return Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), begin_state(reduced, baseline), fold_blocks(reduced))
+
+
+def held(reduced, baseline, drawn, effect, view, column, truth, change):
+    """Share of records whose interval holds the truth, and the mean error of the fit as a share of the truth."""
+    frame = frames(reduced, baseline, effect, view, column)
+    inside, ratio = [], []
+    for number in range(drawn.sizes["record"]):
+        one = reduced.assign(
+            mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
+            power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
+        )
+        state = explain_away(begin_state(change(one), baseline), list(frame.claims[0].parts))
+        (fitted,) = fit_claims(replace(frame, state=state), baseline)
+        found = fitted.parameters[column]
+        inside.append(found.low <= truth <= found.high)
+        ratio.append(found.value / truth)
+    return np.mean(inside), np.mean(ratio) - 1.0, np.std(ratio)
+
+
+def cases(reduced):
+    """Effect, view, parameter, level, form, true size, and what it does to a record."""
+    g, heat = reduced["channel_vibration"].values, reduced["channel_temperature"].values
+    warm = (heat - 25.0) / np.ptp(heat)
+
+    def shifted(shape):
+        return lambda one: one.assign(mean=one["mean"] + xr.DataArray(shape, dims="block"))
+
+    def louder(factor):
+        return lambda one: one.assign(power=one["power"] * xr.DataArray(factor, dims="block"))
+
+    for level, size in (("low", 0.1), ("high", 0.5)):
+        for form, power in (("right", 2.0), ("wrong", 1.9)):
+            yield "vibration_rectification", "mean", "sensitivity", level, form, size / 36.0, shifted(size * (g / 6.0) ** power)
+    for level, share in (("low", 0.2), ("high", 1.0)):
+        for form, power in (("right", 2.0), ("wrong", 1.9)):
+            yield "vibration_noise", "power", "white", level, form, 0.003 * share**0.5 / 6.0, louder(1.0 + share * (g / 6.0) ** power)
+    for level, size in (("low", 0.3), ("high", 2.0)):
+        for form, bend in (("right", 0.0), ("wrong", 0.06)):
+            shape = size * (warm + bend * (warm - warm.min()) * (warm.max() - warm))
+            yield "temperature_bias", "mean", "sensitivity", level, form, size / np.ptp(heat), shifted(shape)
+
+
+if __name__ == "__main__":
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 250
+    reduced = record([])
+    baseline = calibrate(reduced)
+    drawn = next(iter(null_records(reduced, baseline, count=count, rng=np.random.default_rng(8), chunk=count)))
+    print(f"| effect | signal | form | inside 95 %, of {count} | bias | scatter |\n| --- | --- | --- | --- | --- | --- |")
+    for effect, view, column, level, form, truth, change in cases(reduced):
+        share, bias, scatter = held(reduced, baseline, drawn, effect, view, column, truth, change)
+        print(f"| {effect} | {level} | {form} | {share:.1%} | {bias:+.1%} | {scatter:.1%} |", flush=True)

@@ -1,0 +1,130 @@
+"""The noise with the named effects in it: what was there before them, however much of the record they fill."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline import calibrate
+from gyrostab.diagnose.candidates import effect_candidates
+from gyrostab.diagnose.cells import begin_state
+from gyrostab.diagnose.claims import Claim, Naming
+from gyrostab.diagnose.explained import Part, explain_away
+from gyrostab.diagnose.folds import fold_blocks
+from gyrostab.diagnose.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.refit import fit_claims, predicted
+from gyrostab.simulate import simulate
+
+NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
+SHAKE = {"profile": "vibration", "points": [[0, 3.0], [850, 3.0], [851, 6.0], [1800, 6.0]]}
+
+
+def reduced_of(*effects, axes=("x", "y"), environment=()):
+    model = {"noise": NOISE, "effect": list(effects), "environment": list(environment), "log": {"axes": list(axes)}}
+    return reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
+
+
+def naming_of(reduced, baseline, effect, view, columns, **values):
+    """A naming of one effect on the axis x, or on both where it is a property of the pair."""
+    known, reasons = effect_candidates(reduced, baseline["coefficient"])
+    one = next(one for one in known if one.effect == effect and one.view == view)
+    fits = [each for each in one.variants if each.columns == columns]
+    variant = min(fits, key=lambda each: sum(abs(1.0 / (1.0 + each.values[name]) - 1.0 / (1.0 + size)) for name, size in values.items()))
+    rows = [("x", "y")] if view == "cross" else [("x",)]
+    parts = tuple(Part(one, variant, row, 500.0) for row in rows)
+    claim = Claim(effect, one.driver, rows[0], parts, 500.0, 8.0)
+    state = explain_away(begin_state(reduced, baseline), list(parts))
+    return Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced))
+
+
+def noise_of(baseline, term, axis="x"):
+    return tuple(float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr"))
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    reduced = reduced_of({"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, environment=[SHAKE])
+    baseline = calibrate(reduced)
+    naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
+    return naming, baseline, recalibrate(naming, baseline, fit_claims(naming, baseline))
+
+
+def test_vibration_at_two_levels_and_never_none(shaken):
+    _, baseline, after = shaken
+    assert noise_of(baseline, "N")[0] > 1.7 * 0.003
+    value, error = noise_of(after, "N")
+    assert error < 0.2 * value
+    assert abs(value - 0.003) < 3.0 * error
+    assert after.attrs["recalibrated"] == ["x"]
+
+
+def test_an_axis_without_an_effect_keeps_its_noise(shaken):
+    _, baseline, after = shaken
+    for name in ("coefficient", "spectrum", "square", "grid_calibrated", "mean_variance"):
+        np.testing.assert_array_equal(after[name].sel(axis="y"), baseline[name].sel(axis="y"))
+
+
+def test_effect_and_new_noise_make_the_record(shaken):
+    naming, _, after = shaken
+    model = predicted(with_noise(naming, after), after)
+    ratio = (naming.state.reduced["power"] / model["spectrum"]).sel(axis="x")
+    shape = naming.state.reduced["shape"].sel(axis="x")
+    for blocks in (slice(0, 42), slice(43, None)):
+        part = ratio.isel(block=blocks).weighted(shape.isel(block=blocks).fillna(0.0)).mean()
+        assert float(part) == pytest.approx(1.0, abs=5.0 / np.sqrt(float(shape.isel(block=blocks).sum())))
+
+
+def test_noise_of_held_out_time_is_not_used(shaken):
+    naming, baseline, _ = shaken
+    known = np.arange(naming.state.reduced.sizes["block"]) % 2 == 0
+    blind = recalibrate(naming, baseline, [], known)
+    spoiled = naming.state.reduced.copy()
+    spoiled["power"] = spoiled["power"].where(xr.DataArray(known, dims="block"), 99.0)
+    other = recalibrate(replace(naming, state=replace(naming.state, reduced=spoiled)), baseline, [], known)
+    assert noise_of(blind, "N")[0] == pytest.approx(noise_of(other, "N")[0], rel=0.03)
+
+
+def test_what_axes_share_is_no_noise_of_their_own():
+    reduced = reduced_of({"name": "shared_source", "N": 0.002})
+    baseline = calibrate(reduced)
+    naming = naming_of(reduced, baseline, "shared_source", "cross", ("N",), bandwidth=np.inf)
+    after = recalibrate(naming, baseline, fit_claims(naming, baseline))
+    for axis in "xy":
+        assert noise_of(baseline, "N", axis)[0] > 1.15 * 0.003
+        value, error = noise_of(after, "N", axis)
+        assert abs(value - 0.003) < 3.0 * error
+        assert error < 0.1 * value
+    np.testing.assert_allclose(after["spectrum"].median(), baseline["spectrum"].median(), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("table", "grid"),
+    [
+        ({"cutoff": 2.0, "order": 2}, {"cutoff": 2.0, "order": 2.0, "instrument": 1.0, "pick": 0.0, "length": 0.0}),
+        ({"length": 0.5}, {"length": 0.5, "instrument": 1.0, "cutoff": 0.0}),
+    ],
+)
+def test_noise_before_a_filter(table, grid):
+    reduced = reduced_of({"name": "logger_filter", **table}, axes=["x"])
+    baseline = calibrate(reduced)
+    naming = naming_of(reduced, baseline, "logger_filter", "power", (), **grid)
+    (fitted,) = fit_claims(naming, baseline)
+    name = "cutoff" if "cutoff" in table else "length"
+    one = fitted.parameters[name]
+    assert one.low <= table[name] <= one.high
+    assert one.value == pytest.approx(table[name], rel=0.04)
+    after = recalibrate(naming, baseline, [fitted])
+    assert noise_of(baseline, "N")[0] < 0.5 * 0.003
+    value, error = noise_of(after, "N")
+    assert abs(value - 0.003) < 3.0 * error
+    assert error < 0.1 * value
+
+
+def test_a_model_that_was_given_keeps_its_noise(shaken):
+    naming, baseline, _ = shaken
+    given = baseline.assign_attrs(source="model")
+    assert recalibrate(naming, given, []) is given
