@@ -13,8 +13,11 @@ from gyrostab.diagnose.baseline import calibrate
 from gyrostab.diagnose.cells import State, begin_state
 from gyrostab.diagnose.complete import unrest
 from gyrostab.diagnose.explained import reweighted
-from gyrostab.diagnose.name import name_effects
+from gyrostab.diagnose.folds import fold_blocks
+from gyrostab.diagnose.generics import generic_candidates
+from gyrostab.diagnose.name import _Search, name_effects
 from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.search import Found, Tallies, gains
 from gyrostab.log import make_log
 from tests.named import nulls
 
@@ -87,3 +90,18 @@ def test_a_smooth_name_for_bursts_is_taken_back() -> None:
     steady = record(np.linspace(0.9, 1.15, BLOCKS))
     baseline, records = nulls(steady, 40)
     assert [claim.effect for claim in name_effects(steady, baseline, records).claims] == ["ageing_noise"]
+
+
+def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
+    rng = np.random.default_rng(6)
+    loud = np.ones(BLOCKS)
+    loud[40:60] = 20.0
+    reduced = reduce_log(make_log(rng.standard_normal((2, BLOCKS * LENGTH)) * np.repeat(loud, LENGTH), rate=10.0, unit="deg/h"))
+    state = begin_state(reduced, calibrate(reduced))
+    search = _Search(generic_candidates(reduced), fold_blocks(reduced), Tallies({}), 7.0)
+
+    def common(found: list[Found]) -> float:
+        return max(float(one.gain.max()) for one in found if one.candidate.effect == "~cov")
+
+    assert common(gains(search.candidates, reduced, state, search.folds)) > 100.0
+    assert common(search._ranked(state, set())) < 3.0
