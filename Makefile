@@ -4,6 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo-output
 CASES  ?= 400
+NULLS  ?= 400
 PROOF  ?= proof
 
 .PHONY: demo test lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
@@ -42,8 +43,8 @@ bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.
 	$(BIN)/python benchmarks/end_to_end.py --output docs/performance.md
 	$(BIN)/python benchmarks/scaling.py --output docs/scaling.md
 
-prove: $(VENV)/.installed-test  ## the published run on concealed effects: hours; stop and repeat as you like, CASES=400 PROOF=proof
-	$(BIN)/gyrostab prove --resume -o $(PROOF) $(if $(wildcard $(PROOF)/benchmark.json),,--cases $(CASES))
+prove: $(VENV)/.installed-test  ## the published run on concealed effects: hours; stop and repeat as you like, CASES=400 NULLS=400 PROOF=proof
+	$(BIN)/gyrostab prove --resume -o $(PROOF) $(if $(wildcard $(PROOF)/benchmark.json),,--cases $(CASES) --nulls $(NULLS))
 	$(BIN)/python benchmarks/publish_proof.py $(PROOF)
 
 prove-quick: $(VENV)/.installed  ## a few concealed effects of a fresh seed, which is printed

@@ -23,7 +23,7 @@ __all__ = ["Proof", "prove"]
 
 _USUAL = {"cases": 40, "nulls": 400}
 
-_SALTED = 20  # drawn cases to a salted real recording, which makes four more
+_SALTED = 40  # drawn cases to a salted real recording, which makes four more
 
 
 class Proof(NamedTuple):
@@ -74,7 +74,7 @@ def prove(
     workers : int
         Processes; as many as there are cores by default, 0 for none but this one.
     real : path-like
-        Folder of real recordings to be salted, one for every 20 cases; none are without it. See `gyrostab.concealed.real`.
+        Folder of real recordings to be salted, one for every 40 cases; none are without it. See `gyrostab.concealed.real`.
     resume : bool
         Go on with what was begun in the folder; begin where nothing was.
     overwrite : bool

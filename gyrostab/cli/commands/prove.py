@@ -49,7 +49,7 @@ def prove(
     nulls
         Null records of each diagnosis (default: 400; 200 for a quick look).
     real
-        Folder of real recordings (default: $GYROSTAB_RECORDINGS); one is salted for every 20 cases. Without it none is.
+        Folder of real recordings (default: $GYROSTAB_RECORDINGS); one is salted for every 40 cases. Without it none is.
     resume
         Continue a run that was stopped or killed; begin one where there is none.
     """
