@@ -139,7 +139,7 @@ def _opening(job: dict[str, Any], folder: Path) -> str:
     if job["salted"]:
         said += f"\nand {job['salted']} real recordings, each with salt and three times without"
     else:
-        said += "\nno real recordings are salted: their folder is not known"
+        said += f"\nno real recordings are salted: one is for every {_SALTED} cases, where their folder is known"
     done = len(list((folder / "diagnoses").glob("*.json")))
     return said + (f"\n{done} of them are diagnosed already" if done else "")
 

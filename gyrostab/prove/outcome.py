@@ -88,7 +88,7 @@ def page_text(
 def _salted(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     found = salt_differences(rows)
     if not found:
-        return ["None: the folder of the real recordings was not given to this run."]
+        return ["None: the folder of the real recordings was not given to this run, or it had too few cases."]
     lines = [
         f"{one['recording']}, {one['effect']} at {one['strength']:g}: "
         + ("named" if one["named"] else "not named")
