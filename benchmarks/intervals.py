@@ -15,15 +15,15 @@ import xarray as xr
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gyrostab.diagnose.baseline import calibrate  # noqa: E402
-from gyrostab.diagnose.candidates import effect_candidates  # noqa: E402
-from gyrostab.diagnose.cells import begin_state  # noqa: E402
-from gyrostab.diagnose.claims import Claim, Naming  # noqa: E402
-from gyrostab.diagnose.ensemble import null_records  # noqa: E402
-from gyrostab.diagnose.explained import Part, explain_away  # noqa: E402
-from gyrostab.diagnose.folds import fold_blocks  # noqa: E402
-from gyrostab.diagnose.refit import fit_claims  # noqa: E402
-from tests.named import COEFFICIENT, record  # noqa: E402
+from gyrostab.diagnose.baseline import calibrate
+from gyrostab.diagnose.candidates import effect_candidates
+from gyrostab.diagnose.cells import begin_state
+from gyrostab.diagnose.claims import Claim, Naming
+from gyrostab.diagnose.ensemble import null_records
+from gyrostab.diagnose.explained import Part, explain_away
+from gyrostab.diagnose.folds import fold_blocks
+from gyrostab.diagnose.refit import fit_claims
+from tests.named import COEFFICIENT, record
 
 
 def frames(reduced, baseline, effect, view, column):

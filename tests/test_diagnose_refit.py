@@ -87,6 +87,26 @@ def test_intervals_of_vibration_noise_hold_the_truth(quiet, share):
     assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=0.06)
 
 
+@pytest.mark.parametrize(("levels", "both"), [((5.0, 5.0), False), ((3.0, 8.0), True)])
+def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
+    reduced, baseline = quiet
+    place = np.linspace(0.0, 1.0, reduced.sizes["block"])
+    g = np.where((place > 0.2) & (place < 0.4), levels[0], np.where((place > 0.6) & (place < 0.8), levels[1], 0.0))
+    g = g + 0.05 * np.random.default_rng(3).random(g.size)
+    sensitivity, quartic = (0.05, -5e-4) if both else (0.005, 0.0)
+    shape = xr.DataArray(sensitivity * g**2 + quartic * g**4, dims="block")
+    drawn = next(iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1)))
+    one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
+    one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
+    frame = claimed(one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic"))
+    (fitted,) = fit_claims(frame, baseline)
+    assert set(fitted.parameters) == ({"sensitivity", "quartic"} if both else {"sensitivity"})
+    assert ("does not tell" in fitted.say()) is not both
+    for name, truth in (("sensitivity", sensitivity), ("quartic", quartic)):
+        if name in fitted.parameters:
+            assert fitted.parameters[name].low < truth < fitted.parameters[name].high
+
+
 @pytest.fixture(scope="module")
 def shaken():
     reduced = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])

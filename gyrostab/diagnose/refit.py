@@ -17,6 +17,7 @@ from gyrostab.diagnose.explained import Part, explain_away, mean_columns
 from gyrostab.diagnose.filters import filter_sizes
 from gyrostab.diagnose.name import AMBIGUOUS, Claim, Naming
 from gyrostab.diagnose.odd import line_size, mark_sizes
+from gyrostab.diagnose.plainer import plainer
 from gyrostab.diagnose.predict import predicted
 from gyrostab.diagnose.response import is_filter
 from gyrostab.diagnose.sizes import Mixture, part_mixture
@@ -65,18 +66,22 @@ class Fitted:
         Of an effect with a number for each axis: name and axis, with a dot between, where there are several axes.
     effect : Effect or None
         With these numbers, as a model takes it; None where they make no effect.
+    note : str
+        What the numbers do not say.
     """
 
     claim: Claim
     axes: tuple[str, ...]
     parameters: Mapping[str, Estimate]
     effect: Effect | None
+    note: str = ""
 
     def say(self) -> str:
         """One sentence in plain words."""
         if self.effect is None or not self.parameters:
             return f"{effects()[self.claim.effect].short} (on {', '.join(self.axes)})."
-        return self.effect.say({name: one.stderr for name, one in self.parameters.items()})
+        said = self.effect.say({name: one.stderr for name, one in self.parameters.items()})
+        return f"{said} {self.note}" if self.note else said
 
 
 @dataclass(frozen=True)
@@ -135,6 +140,8 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
     for part in parts:
         by_view.setdefault(part.candidate.view, []).append(part)
     view = max(by_view, key=lambda name: sum(part.gain for part in by_view[name]))
+    plain = [plainer(part, state) for part in by_view[view]]
+    by_view[view] = [part for part, _ in plain]
     filtered = is_filter(view, by_view[view][0].variant)
     sizes = {} if filtered else _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
     if filtered:
@@ -145,7 +152,7 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
         _put(values, name, mean, axes)
     values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
     values |= _words(claim, by_view[view][0], state)
-    return Fitted(claim, axes, estimates, _instance(kind, values, axes, claim.driver))
+    return Fitted(claim, axes, estimates, _instance(kind, values, axes, claim.driver), next((note for _, note in plain if note), ""))
 
 
 def _positive(kind: type[Effect], name: str) -> bool:
