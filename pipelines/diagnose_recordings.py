@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 
 import gyrostab
-from gyrostab.diagnose.baseline import calibrate
-from gyrostab.diagnose.reduced import reduce_log
 
 ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 TAUS = "0.005s,0.01s,0.02s,0.04s,0.08s,0.16s,0.32s,0.5s,1s,5s,10s"
@@ -35,14 +33,11 @@ def halves(name, *, nulls=400):
     whole = log_of(name)
     seconds = whole.sizes["time"] / whole.attrs["sampling_rate_hz"]
     first, second = log_of(name, end=seconds / 2), log_of(name, start=seconds / 2)
-    model = gyrostab.diagnose(first, nulls=nulls).model
-    resets = [one for one in model["effect"] if one["name"] == "feedback_reset"]
-    quiet = {axis: dict.fromkeys(terms, 0.0) for axis, terms in model["noise"].items()}
-    clean = first.assign(rate=first["rate"] - gyrostab.simulate({"noise": quiet, "effect": resets}, like=first)["rate"].values)
-    rest = calibrate(reduce_log(clean.compute()))["coefficient"]  # the noise of the model is what was there before the resets were known
-    noise = {axis: {str(term): float(rest.sel(axis=axis, term=term)) for term in rest["term"].values} for axis in quiet}
+    found = gyrostab.diagnose(first, nulls=nulls)
+    before = {axis: {term: one["value"] for term, one in terms.items()} for axis, terms in found.content["baseline"]["noise"].items()}
+    resets = [one for one in found.model["effect"] if one["name"] == "feedback_reset"]
     ratio = {}
-    for case, given in (("five terms", {"noise": model["noise"]}), ("with resets", {"noise": noise, "effect": resets})):
+    for case, given in (("five terms", {"noise": before}), ("with resets", {"noise": found.model["noise"], "effect": resets})):
         made = gyrostab.simulate(given, like=second, seed=1)
         options = {"window": f"{second.sizes['time']}samples", "step": f"{second.sizes['time']}samples", "taus": TAUS}
         both = [gyrostab.davar(log, **options)["avar"].isel(axis=0, time=0) for log in (second, made)]
