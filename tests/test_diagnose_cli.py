@@ -113,6 +113,17 @@ def test_noise_alone_is_no_mismatch_without_any_channel():
 # ------------------------------------------------------------------------------------------------------------------ manners
 
 
+def test_an_axis_that_never_changes_is_left_out():
+    log = white(2)
+    log["rate"][1] = 3.0
+    with pytest.warns(UserWarning, match="the same on axis y: left out"):
+        found = diagnose(log, nulls=100, seed=1)
+    assert found.verdict == "no mismatch"
+    assert found.content["recording"]["axes"] == list(found.content["baseline"]["noise"]) == ["x"]
+    with pytest.raises(SchemaError, match="the same on axis y: there is no noise"):
+        diagnose(log.isel(axis=[1]), nulls=100)
+
+
 def test_an_existing_folder_is_kept(folder: Path, recording: Path, capfd: pytest.CaptureFixture[str]):
     before = (folder / "diagnosis.json").read_bytes()
     capfd.readouterr()

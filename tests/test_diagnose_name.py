@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from gyrostab.diagnose.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.lines import line_gains
 from gyrostab.diagnose.name import Claim, name_effects, tail_level
 from gyrostab.diagnose.search import together
+from gyrostab.diagnose.structure import possible
 from gyrostab.diagnose.surrogates import beats_slides
 from gyrostab.diagnose.tallies import count_gains, expected_counts
 from gyrostab.errors import OptionError
@@ -57,6 +59,16 @@ def test_vibration_noise_is_named_on_its_axis(shaken):
     assert claim.surrogate_p <= 0.01
     assert "temperature_noise" not in claim.alternatives
     assert shaken.verdict == "explained"
+
+
+def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
+    """A part of negative size on an axis without the effect is dropped, not the effect with it."""
+    state, (claim,) = shaken.state, shaken.claims
+    (part,) = (one for one in claim.parts if one.candidate.view == "power")
+    elsewhere = [replace(part, row=(axis,)) for axis in "yz"]
+    sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
+    monkeypatch.setattr(sys.modules["gyrostab.diagnose.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
+    assert possible([part, *elsewhere], state) == [part, elsewhere[1]]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -35,7 +36,7 @@ from gyrostab.diagnose.reduced import reduce_log
 from gyrostab.diagnose.refit import fit_claims, limits, predicted
 from gyrostab.diagnose.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
 from gyrostab.diagnose.surfaces import make_surfaces
-from gyrostab.errors import OptionError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import check_log
 from gyrostab.simulate.model import Model, read_model
@@ -47,6 +48,7 @@ __all__ = ["diagnose", "quiet_span"]
 _KEPT = 3e8  # bytes of null records that are kept rather than drawn twice
 _AT_ONCE = 6.4e7  # bytes of band powers of the null records that are scored together
 _LEAST_NULLS = 100
+_DEAD = 1e-20  # deg^2/h: a power that comes from rounding alone
 
 
 def diagnose(
@@ -94,7 +96,7 @@ def diagnose(
     Raises
     ------
     SchemaError
-        When it is no regular log.
+        When it is no regular log, or no axis ever changes.
     OptionError
         When the record is too short, an option makes no sense, or recording and simulation do not fit together.
 
@@ -129,6 +131,10 @@ def _diagnose(
     if isinstance(given, xr.Dataset):
         _check_alike(log, given)
     reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
+    alive = _axes_alive(reduced)
+    if len(alive) < log.sizes["axis"]:
+        reduced = reduce_log(log.sel(axis=alive), block=block, restart_gap=restart_gap, progress=progress)
+        given = given.sel(axis=alive) if isinstance(given, xr.Dataset) else given
     progress("calibrating", 0)
     baseline = _baseline(reduced, given, quiet, restart_gap, progress)
     records = _records(reduced, baseline, nulls, seed)
@@ -149,6 +155,19 @@ def _check_options(nulls: int, level: float, seed: int) -> None:
         raise OptionError(f"nulls={nulls!r}: fewer than {_LEAST_NULLS} records do not tell how often chance does as much; give 400")
     if seed < 0:
         raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
+
+
+def _axes_alive(reduced: xr.Dataset) -> list[str]:
+    """Axes whose samples are not all the same; warns of the others, which have no noise that could be compared."""
+    loudest = reduced["power"].max(["block", "band"]).values
+    axes = [str(axis) for axis in reduced["axis"].values]
+    alive = [axis for axis, power in zip(axes, loudest, strict=True) if not power <= _DEAD]
+    dead = [axis for axis in axes if axis not in alive]
+    if not alive:
+        raise SchemaError(f"all samples are the same on axis {', '.join(dead)}: there is no noise to compare; is it the right column?")
+    if dead:
+        warnings.warn(f"all samples are the same on axis {', '.join(dead)}: left out of the diagnosis", stacklevel=4)
+    return alive
 
 
 def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:

@@ -21,7 +21,7 @@ from gyrostab.diagnose.generics import generic_candidates
 from gyrostab.diagnose.lattice import rounded_rates
 from gyrostab.diagnose.parts import PLAIN_LINE, axes_of, by_key, gain_of, gain_sum, parts_of, tried_again, without_lines
 from gyrostab.diagnose.search import Found, Tallies, gains, totals
-from gyrostab.diagnose.structure import allowed, structural
+from gyrostab.diagnose.structure import possible, structural
 from gyrostab.diagnose.surrogates import beats_slides
 from gyrostab.diagnose.tallies import Expected
 from gyrostab.errors import OptionError
@@ -201,6 +201,8 @@ class _Search:
         """The next effect, or generic; None when nothing passes. Second: keys that are out of the race from now on."""
         parts = without_lines(by_key(found))
         need = {key: self.threshold + form_error(several, chosen, share=FORM) for key, several in parts.items()}
+        for key in [key for key in parts if not key.startswith("~") and gain_sum(parts[key]) > need[key]]:
+            parts[key] = possible(parts[key], state)
         ranked = sorted(parts, key=lambda key: -gain_sum(parts[key]))
         passing = [key for key in ranked if gain_sum(parts[key]) > need[key]]
         odd = [key for key in passing if parts[key][0].candidate.view == "marks" and not key.startswith("~")]
@@ -214,10 +216,6 @@ class _Search:
         rivals.sort(key=lambda key: -gain_sum(parts[key]) + AMBIGUOUS * self._lonely(parts[key]))
         rejected: set[str] = set()
         for key in rivals:
-            effect = parts[key][0].candidate.effect
-            if not allowed(effect, parts[key], state):
-                rejected.add(key)
-                continue
             passed, p_value = beats_slides(parts[key], state, self.folds)
             if not passed:
                 rejected.add(key)
@@ -225,8 +223,7 @@ class _Search:
             close = [
                 one for one in rivals if one != key and one not in rejected and gain_sum(parts[one]) >= gain_sum(parts[key]) - AMBIGUOUS
             ]
-            names = [parts[one][0].candidate.effect for one in close if allowed(parts[one][0].candidate.effect, parts[one], state)]
-            return self._claim(parts[key], need[key], names, p_value), rejected
+            return self._claim(parts[key], need[key], [parts[one][0].candidate.effect for one in close], p_value), rejected
         if rejected:
             return None, rejected
         generic = passing[0]
@@ -288,7 +285,7 @@ class _Search:
             and other != key
             and not other.startswith("~")
             and gain_sum(several) >= gain - AMBIGUOUS
-            and allowed(several[0].candidate.effect, several, state)
+            and gain_sum(possible(several, state)) >= gain - AMBIGUOUS
         ]
         lines = {part.place for other in chosen for part in other.parts if part.candidate.effect == PLAIN_LINE}
         rivals += structural(claim.effect, claim.parts, state, lines=len(lines))

@@ -53,7 +53,10 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
     spread = _spread(reduced, row)
     error = math.sqrt(count + usual)
     if effect == "spikes":
-        seen, size = _outlier(count / samples, spread, max(float(np.nanmean(reduced["kurtosis"].sel(axis=axis))), 1e-3))
+        excess = float(reduced["kurtosis"].sel(axis=axis).mean())
+        if not math.isfinite(excess):  # no block was steady enough to have one
+            return {"per_hour": (count / _PER_SPIKE / hours, error / _PER_SPIKE / hours)}
+        seen, size = _outlier(count / samples, spread, max(excess, 1e-3))
         return {"per_hour": (count / seen / hours, error / seen / hours + 0.2 * count / seen / hours), "size": (size, 0.3 * size)}
     if effect == "held_samples":
         return {"per_hour": (count / hours, error / hours), "length": (1.0 / rate, 0.5 / rate)}

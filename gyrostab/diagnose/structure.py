@@ -9,7 +9,7 @@ import numpy as np
 from gyrostab.diagnose.cells import State
 from gyrostab.diagnose.explained import Part
 
-__all__ = ["STRUCTURAL", "allowed", "structural"]
+__all__ = ["STRUCTURAL", "possible", "structural"]
 
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 STRUCTURAL: dict[str, tuple[str, ...]] = {
@@ -25,20 +25,22 @@ _MOVING = 1.5  # times the expected power, from which on an axis moves
 _LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
 
 
-def allowed(effect: str, parts: Sequence[Part], state: State) -> bool:
-    """Whether the sizes that fit are possible for the effect."""
+def possible(parts: Sequence[Part], state: State) -> list[Part]:
+    """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not."""
+    return [part for part in parts if _possible(part, state)]
+
+
+def _possible(part: Part, state: State) -> bool:
     from gyrostab.diagnose.sizes import part_size
 
-    for part in parts:
-        if effect == "misalignment" and part.candidate.view == "transfer" and not _moves(part.candidate.witness[0], state):
-            return False
-        if effect == "fringe_hop" and abs(part_size(part, state)[0]) * np.abs(part.variant.design).max() < _SMALLEST_FRINGE:
-            return False
-        if effect in _LARGEST and part.variant.columns[0] != "any" and abs(part_size(part, state)[0]) > _LARGEST[effect]:
-            return False
-        if part.variant.squared and part.candidate.view == "power" and part_size(part, state)[0] <= 0.0:
-            return False
-    return True
+    effect, view = part.candidate.effect, part.candidate.view
+    if effect == "misalignment" and view == "transfer" and not _moves(part.candidate.witness[0], state):
+        return False
+    if effect == "fringe_hop" and abs(part_size(part, state)[0]) * np.abs(part.variant.design).max() < _SMALLEST_FRINGE:
+        return False
+    if effect in _LARGEST and part.variant.columns[0] != "any" and abs(part_size(part, state)[0]) > _LARGEST[effect]:
+        return False
+    return not (part.variant.squared and view == "power" and part_size(part, state)[0] <= 0.0)
 
 
 def _moves(axis: str, state: State) -> bool:
