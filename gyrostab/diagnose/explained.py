@@ -77,9 +77,11 @@ def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
     reduced = state.reduced
     y = reduced["mean"].values[row] - state.baseline["known_mean"].values[row]
     good = np.isfinite(y)
-    design = np.stack([np.ones(y.size), *columns], axis=1)
-    size, *_ = np.linalg.lstsq(design[good] / np.abs(design).max(axis=0), y[good], rcond=None)
-    curve = (design / np.abs(design).max(axis=0)) @ size
+    design = np.nan_to_num(np.stack([np.ones(y.size), *columns], axis=1))
+    largest = np.abs(design).max(axis=0)
+    design = design[:, largest > 0.0] / largest[largest > 0.0]
+    size, *_ = np.linalg.lstsq(design[good], y[good], rcond=None)
+    curve = design @ size
     step = np.abs(np.diff(curve))
     moved = np.maximum(np.append(step, 0.0), np.append(0.0, step))
     seconds = float(reduced.attrs["block_s"])

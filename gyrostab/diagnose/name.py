@@ -21,7 +21,7 @@ from gyrostab.diagnose.generics import generic_candidates
 from gyrostab.diagnose.lattice import rounded_rates
 from gyrostab.diagnose.parts import PLAIN_LINE, axes_of, by_key, gain_of, gain_sum, parts_of, tried_again, without_lines
 from gyrostab.diagnose.search import Found, Tallies, gains, totals
-from gyrostab.diagnose.structure import possible, structural
+from gyrostab.diagnose.structure import PLAINER, possible, structural
 from gyrostab.diagnose.surrogates import beats_slides
 from gyrostab.diagnose.tallies import Expected
 from gyrostab.errors import OptionError
@@ -164,7 +164,7 @@ class _Search:
                 barred |= self._counted(one)
                 state = explain_away(state, list(one.parts))
         chosen = self._pruned(start, chosen)
-        claims = [self._finished(start, one, chosen) for one in chosen if isinstance(one, Claim)]
+        chosen, claims = self._settled(start, chosen)
         unknown = [one for one in chosen if isinstance(one, Unknown)]
         state = self._with(start, [*claims, *unknown])
         claims, withdrawn = self._complete(start, state, claims, unknown)
@@ -213,7 +213,8 @@ class _Search:
             return None
         top = gain_sum(parts[passing[0]])
         rivals = [key for key in passing if not key.startswith("~") and gain_sum(parts[key]) >= top - AMBIGUOUS - FORM * top]
-        rivals.sort(key=lambda key: -gain_sum(parts[key]) + AMBIGUOUS * self._lonely(parts[key]))
+        effects = {parts[key][0].candidate.effect for key in rivals}
+        rivals.sort(key=lambda key: -gain_sum(parts[key]) + AMBIGUOUS * (self._lonely(parts[key]) or _roundabout(parts[key], effects)))
         rejected: set[str] = set()
         for key in rivals:
             passed, p_value = beats_slides(parts[key], state, self.folds)
@@ -266,6 +267,15 @@ class _Search:
             if max((gain_sum(parts) for parts in again.values()), default=0.0) < self.threshold:
                 chosen = [other for other in chosen if other is not one]
         return chosen
+
+    def _settled(self, start: State, chosen: list[Claim | Unknown]) -> tuple[list[Claim | Unknown], list[Claim]]:
+        """What is chosen, and its claims with their last gains; without those that beside the others no longer reach their threshold."""
+        while True:
+            claims = {place: self._finished(start, one, chosen) for place, one in enumerate(chosen) if isinstance(one, Claim)}
+            weak = min(claims, key=lambda place: claims[place].gain - claims[place].threshold, default=None)
+            if weak is None or claims[weak].gain >= claims[weak].threshold:
+                return chosen, list(claims.values())
+            chosen = [*chosen[:weak], *chosen[weak + 1 :]]
 
     def _finished(self, start: State, claim: Claim, chosen: Sequence[Claim | Unknown]) -> Claim:
         """The claim with its gain and its rivals when all the others are in the model."""
@@ -335,3 +345,8 @@ def _weak(named: Sequence[Claim], left: float) -> tuple[list[Claim], float]:
 def _witnessed(parts: Sequence[Part], state: State) -> list[Part]:
     """Parts that a channel sees as well, which is no axis of the gyro itself."""
     return [part for part in parts if part.candidate.view == "transfer" and part.candidate.witness[0] not in state.axes]
+
+
+def _roundabout(parts: Sequence[Part], effects: set[str]) -> bool:
+    """An effect that says less plainly what another one of `effects` says as well."""
+    return PLAINER.get(parts[0].candidate.effect) in effects

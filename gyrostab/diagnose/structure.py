@@ -9,7 +9,7 @@ import numpy as np
 from gyrostab.diagnose.cells import State
 from gyrostab.diagnose.explained import Part
 
-__all__ = ["STRUCTURAL", "possible", "structural"]
+__all__ = ["PLAINER", "STRUCTURAL", "possible", "structural"]
 
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 STRUCTURAL: dict[str, tuple[str, ...]] = {
@@ -17,7 +17,9 @@ STRUCTURAL: dict[str, tuple[str, ...]] = {
     "telegraph": ("gauss_markov",),
     "spectral_line": ("real_motion", "supply_bias"),
 }
-#: Effect -> largest size that is plausible, by parameter.
+#: Effect -> effect that it becomes where a parameter goes to its end: without play, hysteresis is proportional to temperature.
+PLAINER = {"thermal_hysteresis": "temperature_bias"}
+#: Effect -> largest size that is plausible, of each of its parameters.
 _LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
 _SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
 _COMB = 3  # lines that may be one comb
@@ -31,15 +33,15 @@ def possible(parts: Sequence[Part], state: State) -> list[Part]:
 
 
 def _possible(part: Part, state: State) -> bool:
-    from gyrostab.diagnose.sizes import part_size
+    from gyrostab.diagnose.sizes import part_mixture, part_size
 
     effect, view = part.candidate.effect, part.candidate.view
     if effect == "misalignment" and view == "transfer" and not _moves(part.candidate.witness[0], state):
         return False
     if effect == "fringe_hop" and abs(part_size(part, state)[0]) * np.abs(part.variant.design).max() < _SMALLEST_FRINGE:
         return False
-    if effect in _LARGEST and part.variant.columns[0] != "any" and abs(part_size(part, state)[0]) > _LARGEST[effect]:
-        return False
+    if effect in _LARGEST and part.variant.columns[0] != "any":
+        return bool(np.abs(part_mixture(part, state).moments()[0]).max() <= _LARGEST[effect])
     return not (part.variant.squared and view == "power" and part_size(part, state)[0] <= 0.0)
 
 
