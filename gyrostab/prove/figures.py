@@ -98,5 +98,5 @@ def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
     panel.set_yticks(range(len(claims)), [f"{claim['name'].replace('_', ' ')} ({claim['n']})" for claim in claims])
     panel.set_ylim(max(len(claims), 1) - 0.4, -0.6)
     panel.set_xlim(0, 1)
-    panel.set_xlabel("share of the claims that are right, with 95 % interval (how often claimed)")
+    panel.set_xlabel("share of the claims (number) that are right,\nwith 95 % interval")
     return lambda target: save_png(figure, target, colours=64)
