@@ -82,6 +82,27 @@ def test_lattices_give_repeats_zeros_and_extremes():
     assert int(extremes.max()) > 2
 
 
+def test_blocks_of_few_samples_may_repeat_them_too():
+    log = simulate({"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=4).compute()
+    lost = np.zeros(log.sizes["time"], bool)
+    for first in range(9000, 27_000, 200):  # four fifths of every block
+        lost[first : first + 160] = True
+    values = np.round((log["rate"] + 2.0) / 0.2) * 0.2  # no zero in these blocks, where the mean is not known
+    log["rate"] = values.where(~xr.DataArray(lost, dims="time")).assign_attrs(log["rate"].attrs)
+    record = reduce_log(log)
+    sparse = np.isnan(record["neighbours"].values[0]) & (record["samples"].values[0] > 0)
+    assert sparse.sum() > 30
+    baseline = calibrate(record)
+    nulls = joined(list(null_records(record, baseline, count=100, rng=np.random.default_rng(2))))
+    many = float(nulls["repeats"].values[:, 0, sparse].sum(axis=1).mean())
+    found = float(record["repeats"].values[0, sparse].sum())
+    assert many > 100
+    assert found == pytest.approx(many, abs=4.0 * np.sqrt(many))
+    assert ((nulls["repeats"] > nulls["adjacent"]).sum()) == 0
+    zeros = nulls["zeros"].values[:, 0, sparse].sum(axis=1)
+    assert float(record["zeros"].values[0, sparse].sum()) <= zeros.mean() + 5.0 * np.sqrt(zeros.mean() + 1.0)
+
+
 def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
     rng = np.random.default_rng(2)
     seconds = np.arange(36_000) / 10.0

@@ -51,6 +51,7 @@ class Accumulator:
         self.power = np.full((rows, blocks, bands), np.nan)
         self.shape = np.full((self.axes, blocks, bands), np.nan)
         self.neighbours = np.full((self.axes, blocks), np.nan)
+        self.adjacent = np.zeros((self.axes, blocks), np.int64)
         self.pairs = [(a, b) for a, b in combinations(range(rows), 2) if a < self.axes]
         self.cross = np.full((len(self.pairs), blocks, bands), np.nan + 0j)
         self.cross_shape = np.full(self.cross.shape, np.nan)
@@ -81,6 +82,7 @@ class Accumulator:
             histogram = self.histogram[row, part] if row < self.axes else np.empty((0, 0), np.uint32)
             kernel.block_samples(stretch.values[row], centred[row], self.moments[row, part], self.counts[row, part], histogram)
         self._spectra(part, centred, present)
+        self.adjacent[:, part] = np.count_nonzero(present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1)
         self._find_gaps(part, present[: self.axes])
         every = max(1, self.blocks // _FOR_LATTICE)
         chosen = [number for number in range(part.start, part.stop) if number % every == 0]

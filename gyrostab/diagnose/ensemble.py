@@ -282,8 +282,8 @@ def _counts(frame: _Frame, count: int, rng: np.random.Generator) -> dict[str, ND
     """Outliers, repeats, extremes and zeros as Gaussian noise on the lattice has them."""
     reduced = frame.reduced
     samples = _ordered(reduced, "samples", "axis", "block").astype(np.int64)
-    near = np.nan_to_num(_ordered(reduced, "neighbours", "axis", "block"), nan=0.0)
-    mean = _ordered(reduced, "mean", "axis", "block")
+    adjacent = _ordered(reduced, "adjacent", "axis", "block").astype(np.int64)
+    mean = _filled(_ordered(reduced, "mean", "axis", "block"))
     repeat, zero = np.zeros(samples.shape), np.zeros(samples.shape)
     for axis, step in enumerate(reduced["lattice"].values):
         if step > 0.0:
@@ -293,16 +293,26 @@ def _counts(frame: _Frame, count: int, rng: np.random.Generator) -> dict[str, ND
     size = (count, *samples.shape)
     return {
         "outliers": rng.poisson(np.broadcast_to(samples * _TAIL, size)),
-        "repeats": rng.binomial((samples * np.clip(near, 0.0, 1.0)).astype(np.int64), np.broadcast_to(repeat, size)),
+        "repeats": rng.binomial(adjacent, np.broadcast_to(repeat, size)),
         "zeros": rng.binomial(samples, np.broadcast_to(zero, size)),
         "extremes": _extremes(frame, samples, count, rng),
     }
 
 
+def _filled(mean: Array) -> Array:
+    """Means with those of blocks of few samples on straight lines between their neighbours; 0 where an axis has none."""
+    out, block = np.zeros_like(mean), np.arange(mean.shape[1])
+    for row, values in enumerate(mean):
+        good = np.isfinite(values)
+        if good.any():
+            out[row] = np.interp(block, block[good], values[good])
+    return out
+
+
 def _lattice_chances(mean: Array, step: float, sd: Array) -> tuple[Array, Array]:
     """Chance in each block that a sample equals the one before, and that it is 0."""
     inner = float(np.sqrt(max(sd[0] ** 2 - step**2 / 12.0, (0.05 * step) ** 2)))
-    centre = np.nan_to_num(mean)[:, None]
+    centre = mean[:, None]
     reach = int(np.ceil(6.0 * inner / step)) + 1
 
     def chance(level: Array) -> Array:

@@ -94,11 +94,12 @@ def reduce_log(log: xr.Dataset, *, block: Any = None, restart_gap: Any = 5.0, pr
     Returns
     -------
     xarray.Dataset
-        By ``(axis, block)``: ``mean`` [degree hour-1], ``samples``, ``neighbours``, ``kurtosis``, ``outliers``, ``repeats``, ``extremes``,
-        ``zeros``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution.
-        ``cross``, ``cross_shape`` (pair, block, band), ``witness_power``, ``witness_cross``, ``line_power(axis, part, line)``,
-        ``line_weight``, ``order(axis, block, harmonic)``, ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``,
-        and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
+        By ``(axis, block)``: ``mean`` [degree hour-1], ``samples``, ``neighbours``, ``adjacent``, ``kurtosis``, ``outliers``,
+        ``repeats``, ``extremes``, ``zeros``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of
+        its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band), ``witness_power``, ``witness_cross``,
+        ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``, ``profile(axis, block, phase)``,
+        ``lattice(axis)``, ``channel_<name>(block)``, and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of
+        the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
     ------
@@ -153,6 +154,7 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
         "neighbours": (plane, work.neighbours, _named("share of neighbouring pairs of samples, tapered", "1")),
         "kurtosis": (plane, np.where(np.isnan(work.neighbours), np.nan, kurtosis), _named("excess kurtosis of the block", "1")),
         "outliers": (plane, count_outliers(work.histogram), _named("second differences beyond 6 robust sigma", "1")),
+        "adjacent": (plane, work.adjacent, _named("samples with another one right before them in the block", "1")),
         "repeats": (plane, counts[..., 2], _named("samples equal to the one before", "1")),
         "extremes": (plane, _extremes(moments, counts), _named("samples equal to the smallest or largest of the record", "1")),
         "zeros": (plane, counts[..., 1], _named("samples that are exactly 0", "1")),
