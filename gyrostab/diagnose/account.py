@@ -19,7 +19,7 @@ __all__ = ["acting", "explanations", "spans"]
 Array = NDArray[np.float64]
 #: Where an effect shows -> views of mismatches that it can explain; "model" ones are looked at again with the effect in the model.
 _SHOWS: dict[str, tuple[str, ...]] = {
-    "mean": ("mean", "restart", "davar", "distribution"),
+    "mean": ("mean", "restart", "davar", "distribution", "cross_axis"),
     "power": ("davar", "spectrum", "distribution"),
     "cross": ("cross_axis", "davar"),
     "marks": ("distribution", "davar", "spectrum"),
@@ -27,7 +27,7 @@ _SHOWS: dict[str, tuple[str, ...]] = {
     "order": ("spectrum", "davar", "mean", "distribution", "cross_axis"),
     "phase_locked": ("spectrum", "davar", "distribution", "mean"),
     "transfer": ("davar", "cross_axis", "spectrum", "mean", "distribution"),
-    "wander": ("mean", "davar", "restart"),
+    "wander": ("mean", "davar", "restart", "cross_axis"),
 }
 _MODELLED = ("mean", "power", "cross", "wander")  # parts that the baseline with the effects holds
 _LEFT = 0.3  # of a mismatch, that an error of the form may leave
@@ -114,15 +114,26 @@ def explanations(
         for claim, its_time in zip(claims, when, strict=True):
             views = {part.candidate.view for part in claim.parts if _can_show(part, box, reduced)}
             near = any(_meet(box, span) for span in its_time) and set(str(box["axes"]).split()) & set(claim.axes)
-            if views and near and (gone or not views <= set(_MODELLED)):
+            if views and near and (gone or not views <= _modelled(claim, box)):
                 names.append(claim.effect)
         out.append(list(dict.fromkeys(names)))
     return out
 
 
+def _modelled(claim: Claim, box: Mapping[str, Any]) -> set[str]:
+    """Parts that must take the mismatch away; that several axes wander as one is in no model, and what wanders on them may do it."""
+    wanders = str(box["what"]) == "slow" and len(set(str(box["axes"]).split()) & set(claim.axes)) > 1
+    return set(_MODELLED) - ({"wander"} if wanders else set())
+
+
 def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
-    """Whether a part of an effect can be seen where a mismatch is; a line explains a line at its own frequency only."""
+    """Whether a part of an effect can be seen where a mismatch is.
+
+    A line explains a line at its own frequency only, and a mean of what axes share only what is slow.
+    """
     if str(box["view"]) not in _SHOWS.get(part.candidate.view, ()):
+        return False
+    if part.candidate.view in ("mean", "wander") and box["view"] == "cross_axis" and box["what"] != "slow":
         return False
     if part.candidate.view != "line" or part.place < 0 or box["view"] == "distribution":
         return True

@@ -51,6 +51,8 @@ def _alike(one: Box, other: Box) -> bool:
         return False
     if one["what"] == "line" or other["what"] == "line":
         return bool(one["what"] == other["what"] and abs(one["frequency"] / other["frequency"] - 1.0) < _LINE)
+    if (one["what"] == "slow") != (other["what"] == "slow"):  # inside blocks, and from block to block
+        return False
     return bool(min(one["tau_max_s"], other["tau_max_s"]) >= 0.99 * max(one["tau_min_s"], other["tau_min_s"]))
 
 

@@ -214,6 +214,9 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
     if box["view"] == "mean":
         size = f" by {abs(estimate):.3g} deg/h" if np.isfinite(estimate) else ""
         return f"The mean rate of {axes} is {'higher' if more else 'lower'}{size} {when} than drift and noise allow ({sure})."
+    if box["view"] == "cross_axis" and box.get("what") == "slow":
+        size = f" (correlation {estimate:.2g})"
+        return f"{begin} wander together{size} {when}, at {taus}, which the random walks of independent gyros do not ({sure})."
     if box["view"] == "cross_axis":
         size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
         return f"{begin} vary together{size} {when}, at {taus}, which independent gyros do not ({sure})."

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import xarray as xr
 
-from gyrostab.diagnose.views import cross_axis, davar, distribution, locked, mean, restart, spectrum
+from gyrostab.diagnose.views import common, cross_axis, davar, distribution, locked, mean, restart, spectrum
 
 __all__ = ["VIEWS"]
 
@@ -19,6 +19,7 @@ VIEWS: dict[str, Callable[[xr.Dataset, xr.Dataset], xr.Dataset | None]] = {
     "davar": davar.score,
     "mean": mean.score,
     "cross_axis": cross_axis.score,
+    "common": common.score,
     "spectrum": spectrum.score,
     "locked": locked.score,
     "distribution": distribution.score,
