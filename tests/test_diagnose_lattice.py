@@ -36,9 +36,9 @@ def on_lattice(kind: str, steps: float, *, mean: float = 3.0, seed: int = 1, siz
     return reduce_log(make_log(np.rint(rates / step) * step, rate=10.0, unit="deg/h"))
 
 
-@pytest.mark.parametrize("steps", [1.5, 2.0, 4.0])
+@pytest.mark.parametrize("steps", [0.85, 1.5, 4.0])
 @pytest.mark.parametrize("mean", [3.0, 0.05])
-def test_coarse_steps_are_told_apart(steps: float, mean: float) -> None:
+def test_steps_are_told_apart(steps: float, mean: float) -> None:
     for kind, expected in (("rate", True), ("angle", False)):
         reduced = on_lattice(kind, steps, mean=mean)
         np.testing.assert_allclose(reduced["lattice"], steps * SCATTER, rtol=1e-6)
@@ -50,6 +50,25 @@ def test_fine_steps_are_nobodys(kind: str) -> None:
     reduced = on_lattice(kind, 0.3)
     assert (reduced["lattice"] > 0).all()
     assert not rounded_rates(reduced, calibrate(reduced)).any()
+
+
+def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
+    rng = np.random.default_rng(4)
+    rates = 3.0 + SCATTER * rng.standard_normal((2, 18_001))
+    step = 0.85 * SCATTER
+    smooth = 0.8 * rates[:, 1:] + 0.2 * rates[:, :-1]  # takes more from the highest frequencies than the steps add
+    counted = np.diff(np.floor(np.cumsum(smooth, axis=1) / step), axis=1, prepend=0.0) * step
+    reduced = reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
+    assert (reduced["lattice"] > 0).all()
+    assert not rounded_rates(reduced, calibrate(reduced)).any()
+
+
+def test_axes_tell_together_what_one_tells_not() -> None:
+    reduced = on_lattice("rate", 0.7)
+    baseline = calibrate(reduced)
+    alone = [rounded_rates(reduced.isel(axis=[number]), baseline.isel(axis=[number])) for number in range(2)]
+    assert not np.concatenate(alone).any()
+    assert rounded_rates(reduced, baseline).all()
 
 
 def test_without_a_lattice_nothing_was_rounded() -> None:

@@ -2,8 +2,9 @@
 
 Both stand on the same lattice. Rounding the rate to steps s adds the same error of variance s^2 / 12 to every sample by itself, which is
 white. Differences of an angle that is rounded to steps s dt have errors that the next sample takes back: the angle quantization
-Q = s dt / sqrt(12) of the noise, which the baseline holds. So a rounded rate is claimed only where its white noise is large enough to
-be seen, and where the Q that is seen is less than what the lattice would make if it were one of angles.
+Q = s dt / sqrt(12) of the noise, which raises the power at the highest frequency by s^2 / 3 over the variance of a sample, and which the
+baseline holds. So a rounded rate is claimed where the spectrum rules out the Q that the lattice would make if it were one of angles. From n
+samples Q^2 is known to about 1 / sqrt(n) of the variance of a sample: with 10^5 of them, a step of half their scatter can be told.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.posterior import fit_squares, summed
 from gyrostab.noise import HOUR, URAD_PER_S
 
 __all__ = ["angle_share", "rounded_rates"]
 
-_SEEN = 3.0  # standard errors
-_LESS = 0.5  # of the Q of a lattice of angles: its error is a sawtooth, not white, where the noise is less than a step
+_SURE, _OWN = 4.0, 2.0  # standard errors by which all axes together, and each by itself, must fall short of the Q of a counter
+_NEAR = 0.5  # of that Q: a rounded rate is nearer to none than to that, on either side; a filter takes more from the highest frequencies
+_SHOWN = 0.01  # of the variance of a sample: the form of the spectrum is not known better
 _TERMS = 40
 
 
@@ -45,14 +48,38 @@ def rounded_rates(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_
 
         baseline = calibrate(reduced)
     rate = float(reduced.attrs["sampling_rate_hz"])
-    Q, N = (baseline["square"].sel(noise=term).values for term in "QN")
-    Q_error, N_error = (baseline["square_stderr"].sel(noise=term).values for term in "QN")
-    variance = step**2 / 12.0
-    of_angles = variance / (rate * URAD_PER_S) ** 2
-    seen = variance / (HOUR * rate) > _SEEN * N_error
+    white = baseline["square"].sel(noise="N").values * HOUR * rate
     quiet = baseline["quiet"].transpose("axis", "block").values
-    share = np.array([_own_share(*row) for row in zip(reduced["mean"].values, quiet, step, np.sqrt(N * HOUR * rate), strict=True)])
-    return np.asarray((step > 0.0) & seen & (Q + _SEEN * Q_error < _LESS * share * of_angles))
+    share = np.array([_own_share(*row) for row in zip(reduced["mean"].values, quiet, step, np.sqrt(white), strict=True)])
+    of_angles = np.where(step > 0.0, share * step**2 / 12.0 / (rate * URAD_PER_S) ** 2, np.nan)
+    ratio, error = _own_square(reduced, baseline) / of_angles, baseline["square_stderr"].sel(noise="Q").values / of_angles
+    with np.errstate(divide="ignore", invalid="ignore"):
+        known = (step**2 / 12.0 > _SHOWN * white) & np.isfinite(ratio) & (error > 0.0)
+        short = (1.0 - ratio) / error
+    if not known.any():
+        return known
+    weight = error[known] ** -2.0  # one logger writes all axes in one way
+    together = float(weight @ ratio[known] / weight.sum())
+    if (1.0 - together) * np.sqrt(weight.sum()) < _SURE or abs(together) > _NEAR:
+        return np.zeros(step.shape, np.bool_)
+    return np.asarray(known & (ratio < _NEAR) & (short > _OWN))
+
+
+def _own_square(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.float64]:
+    """Square of Q that fits the powers of the quiet blocks best on every axis, less than 0 where these fall towards the end."""
+    out = []
+    for number in range(reduced.sizes["axis"]):
+        quiet = baseline["quiet"].transpose("axis", "block").values[number]
+        power, shape = (reduced[name].transpose("axis", "block", "band").values[number][quiet] for name in ("power", "shape"))
+        columns = baseline["columns"].transpose("axis", "block", "band", "noise").values[number][quiet]
+        fit = summed(power, shape, columns)
+        square = fit_squares(fit)[0]
+        weight = fit.weight / (fit.columns @ square) ** 2
+        used = (square > 0.0) | np.array([True, True, False, False])
+        normal = (fit.columns.T * weight) @ fit.columns
+        right = (fit.columns.T * weight) @ fit.power
+        out.append(np.linalg.lstsq(normal[np.ix_(used, used)], right[used], rcond=None)[0][0] if fit.power.size else np.nan)
+    return np.array(out)
 
 
 def _own_share(mean: NDArray[Any], quiet: NDArray[np.bool_], step: float, scatter: float) -> float:
