@@ -62,7 +62,7 @@ def _with(found, shares):
     return found.assign(mean=found["mean"] + xr.DataArray(np.asarray(shares)[:, None] * _waveform(), dims=("axis", "block")))
 
 
-@pytest.mark.parametrize(("told", "true"), [(0.0, 0.0), (0.1, 0.1), (1.0, 0.02)])
+@pytest.mark.parametrize(("told", "true"), [(0.0, 0.0), (0.1, 0.1), (1.0, 0.02), (0.02, 1.0)])
 @pytest.mark.parametrize("missing", [0, 40])
 def test_axes_that_wander_by_themselves_have_normal_scores(told, true, missing):
     found = _means(baseline(walk=true), 60, 3)
@@ -70,7 +70,7 @@ def test_axes_that_wander_by_themselves_have_normal_scores(told, true, missing):
     z = common.score(found, baseline(walk=told))["z"].values
     few = z[:, :-1, -1, :3]  # of each pair over the whole record, for spans that leave many averages
     assert abs(few.mean()) < 4.0 / np.sqrt(180.0)
-    assert 0.85 < few.std() < 1.2
+    assert 0.7 < few.std() < 1.2  # less where increments are taken for related that are not
 
 
 @pytest.mark.parametrize("shares", [(1.0, 0.8, -0.9), (-0.5, 1.0, 0.7)])

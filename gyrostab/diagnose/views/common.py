@@ -135,7 +135,18 @@ def _correlations(
     with np.errstate(divide="ignore", invalid="ignore"):
         r = np.clip(product / np.sqrt(square[..., one, :] * square[..., other, :]), -1.0, 1.0)
     count = over((there[one] & there[other]).astype(float)) * (_OVERLAP / span if span > 1 else 1.0)
-    return np.where(count >= _FEWEST, r, np.nan), count
+    remembered = _memory(summed, one, other)[..., None] * (_OVERLAP / span if span > 1 else 1.0)
+    return np.where(count >= _FEWEST, r, np.nan), count / np.maximum(remembered, 1.0)
+
+
+def _memory(summed: Array, one: list[int], other: list[int]) -> Array:
+    """Blocks that an independent value takes in each pair: the sum of the products of their autocorrelations (Bartlett 1935)."""
+    n = summed.shape[-1]
+    power = np.abs(np.fft.rfft(summed, 2 * n, axis=-1)) ** 2
+    own = np.fft.irfft(power, 2 * n, axis=-1)[..., : n // 4]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = np.nan_to_num(own / own[..., :1])
+    return np.asarray(2.0 * (own[..., one, :] * own[..., other, :]).sum(axis=-1) - 1.0)
 
 
 def _moving(values: Array, span: int) -> Array:
@@ -153,7 +164,7 @@ def _together(r: Array, count: Array, pairs: list[tuple[int, int]], axes: int) -
         matrix[..., a, b] = matrix[..., b, a] = r[..., place, :, :]
     known = np.asarray(np.isfinite(matrix).all(axis=(-2, -1)))
     sign, logarithm = np.linalg.slogdet(np.where(known[..., None, None], matrix, np.eye(axes)))
-    samples = count.min(axis=-3) - (2.0 * axes + 5.0) / 6.0
+    samples = np.maximum(count.min(axis=-3) - (2.0 * axes + 5.0) / 6.0, 1.0)
     freedom = len(pairs)
     value = -samples * np.where(sign > 0, np.maximum(logarithm, _SINGULAR), _SINGULAR) / freedom
     return np.where(known, cube_root_score(value, np.full(value.shape, freedom / 2.0)), np.nan)
