@@ -71,18 +71,27 @@ def test_without_a_channel_the_reason_names_it(plain):
 
 
 def test_a_channel_that_stands_still_excites_nothing(plain):
-    still = plain.assign(channel_temperature=plain["channel_temperature"] * 0.0 + 20.0)
+    still = plain.assign({name: plain[name] * 0.0 + 20.0 for name in ("channel_temperature", "fine_temperature")})
     candidates, reasons = effect_candidates(still, COEFFICIENT)
     assert not [one for one in candidates if one.effect == "shupe"]
     assert reasons["shupe"] == "not identifiable: temperature does not change"
 
 
-def test_no_axis_is_explained_by_its_own_reading(found):
-    leak = next(one for one in found[0] if one.effect == "misalignment" and one.view == "mean")
+def test_no_axis_is_explained_by_its_own_reading(plain, found):
+    turning = 500.0 * np.sin(np.linspace(0.0, 6.0, plain.sizes["block"]))
+    moving = plain.assign(mean=plain["mean"] + turning)
+    leak = next(one for one in effect_candidates(moving, COEFFICIENT)[0] if one.effect == "misalignment" and one.view == "mean")
     for variant in leak.variants:
         for name, design in zip(variant.columns, variant.design, strict=True):
             assert not design["xyz".index(name)].any()
     assert not [one for one in found[0] if one.effect in ("dead_zone", "clock_error") and one.view == "mean"]
+
+
+def test_axes_at_rest_cannot_leak(plain, found):
+    assert not [one for one in found[0] if one.effect == "misalignment" and one.view == "mean"]
+    turning = plain.assign(mean=plain["mean"] + xr.where(plain["axis"] == "z", 1.0, 0.0) * np.linspace(0.0, 500.0, plain.sizes["block"]))
+    leak = next(one for one in effect_candidates(turning, COEFFICIENT)[0] if one.effect == "misalignment" and one.view == "mean")
+    assert [variant.columns for variant in leak.variants] == [("z",)]
 
 
 def test_mean_designs_are_what_the_simulator_adds(plain):

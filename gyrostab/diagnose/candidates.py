@@ -12,13 +12,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.designs import BUILDERS, Candidate, Variant, term_density
+from gyrostab.diagnose.reduced import measured
 from gyrostab.diagnose.tallies import OF_LATTICE, coarse_lattice
 from gyrostab.errors import OptionError
+from gyrostab.noise import HOUR
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
 
 __all__ = [
+    "LARGEST",
     "VIEWS",
     "Candidate",
     "Variant",
@@ -33,6 +36,9 @@ Array = NDArray[Any]
 #: Where an effect can show, in the order in which they are looked at.
 VIEWS = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander")
 _MOST_VALUES, _MOST_VARIANTS = 60, 200
+#: Effect -> largest size that is plausible, of each of its parameters.
+LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
+_SEEN = 3.0  # standard errors that an effect of the largest size must have to be looked for
 _INSTANT = "at"  # nuisance parameter that is an instant
 _LEAST_SHARE = 0.5  # of the blocks in which a channel must have data
 _TWINS = {"fringe_hop": "bias_jump"}  # the same design: the size decides
@@ -56,7 +62,7 @@ def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         Channel of the effect -> channel of the log.
     """
     axes = tuple(str(axis) for axis in reduced["axis"].values)
-    own = dict(zip(axes, map(_bridged, reduced["mean"].transpose("axis", "block").values), strict=True))
+    own = dict(zip(axes, map(_bridged, measured(reduced, "mean").transpose("axis", "block").values), strict=True))
 
     def spans(name: str) -> Array:
         if f"{name}_begin" not in reduced:
@@ -185,7 +191,7 @@ def _of_kind(kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], c
     for values in _grid(kind, windows):
         try:
             effect = kind.example(**values)
-            predictions.append((values, _exogenous(effect, windows)))
+            predictions.append((values, _visible(kind.name, _exogenous(effect, windows), reduced, coefficient)))
         except KeyError as error:
             why = f"the recording has no channel {error.args[0]}"
         except OptionError as error:
@@ -278,6 +284,24 @@ def _exogenous(effect: Effect, windows: Windows) -> Prediction:
             if not np.array_equal(seen, values[row]):
                 values[row] = 0.0
     return replace(whole, mean=mean)
+
+
+def _visible(name: str, seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Prediction:
+    """What an effect predicts, without the means that white noise alone hides on every axis at the largest size there is.
+
+    An axis at rest cannot leak into others: its noise, taken for a motion, would only blur what moves.
+    """
+    if name not in LARGEST or not seen.mean:
+        return seen
+    good = np.isfinite(reduced["mean"].transpose("axis", "block").values)
+    white = coefficient.sel(term="N").values * np.sqrt(HOUR / float(reduced.attrs["block_s"]))
+    mean = {}
+    for column, design in seen.mean.items():
+        rows = np.where(good, np.broadcast_to(np.atleast_2d(design), good.shape), np.nan)
+        moved = np.sqrt(np.nansum((rows - np.nanmean(rows, axis=1, keepdims=True)) ** 2, axis=1))
+        if (LARGEST[name] * moved > _SEEN * white).any():
+            mean[column] = design
+    return replace(seen, mean=mean)
 
 
 def _distinct(variants: list[Variant]) -> tuple[Variant, ...]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.candidates import Candidate
 from gyrostab.diagnose.gain import Cells, independent, noise_columns
+from gyrostab.diagnose.reduced import measured
 
 __all__ = ["State", "begin_state", "cells_of", "drawn", "effective", "pair_rows", "view_rows"]
 
@@ -254,12 +255,13 @@ def witness_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset) -> tu
     """Cross-power of an axis with a channel or another axis, (block, band, record), and the power of that, (block, band)."""
     axes = [str(one) for one in reduced["axis"].values]
     if name in axes:
-        cross = _records(data["cross"].transpose(..., "pair", "block", "band").values, 3)
+        cross = _records(measured(data, "cross").transpose(..., "pair", "block", "band").values, 3)
+        there = np.isfinite(reduced["power"].values[row])[..., None]
         found = np.full(cross.shape[1:], np.nan + 0j)
         for number, pair in enumerate(pair_rows(reduced)):
             if set(pair) == {name, axes[row]} and name != axes[row]:
-                found = np.conj(cross[number]) if pair[0] == name else cross[number]
-        return found, reduced["power"].sel(axis=name).transpose("block", "band").values
+                found = np.where(there, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan)
+        return found, measured(reduced, "power").sel(axis=name).transpose("block", "band").values
     place = [str(one) for one in reduced["witness"].values].index(name)
     cross = _records(data["witness_cross"].transpose(..., "axis", "witness", "block", "band").values, 4)
     return cross[row, place], reduced["witness_power"].transpose("witness", "block", "band").values[place]
@@ -269,7 +271,7 @@ def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state
     cross, power = witness_of(candidates[0].witness[0], row, data, state.reduced)
     root = np.sqrt(np.where(power > 0.0, power, np.nan))
     weight = 2.0 * state.reduced["shape"].values[row] / state.weight[row]
-    weight = np.where(np.isfinite(root) & ~state.masked[row][:, None], weight, 0.0)
+    weight = np.where(np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0)
     weight = np.concatenate([weight, weight], axis=1)
     with np.errstate(invalid="ignore"):
         values = _parts(cross / root[..., None], axis=1)

@@ -15,9 +15,19 @@ from gyrostab.diagnose.account import acting, spans
 from gyrostab.diagnose.explained import Part
 from gyrostab.diagnose.generics import GENERICS
 from gyrostab.diagnose.name import Claim, Naming, Unknown
+from gyrostab.diagnose.reduced import measured
 from gyrostab.diagnose.refit import Fitted, Limit
 from gyrostab.diagnose.result import effect_table
-from gyrostab.diagnose.sentences import axes_text, chance, effect_statement, mismatch_statement, named_statement, plain_name, span_text
+from gyrostab.diagnose.sentences import (
+    axes_text,
+    chance,
+    effect_statement,
+    mismatch_statement,
+    motion_statement,
+    named_statement,
+    plain_name,
+    span_text,
+)
 from gyrostab.noise import LAWS
 from gyrostab.simulate.model import Model
 
@@ -30,6 +40,7 @@ __all__ = [
     "limit_tables",
     "mismatch_tables",
     "model_tables",
+    "motion_tables",
     "recording_table",
     "surfaces_with_blocks",
     "unknown_tables",
@@ -188,6 +199,43 @@ def _unknown_table(one: Unknown, naming: Naming, reduced: xr.Dataset, number: in
         "explained_by": [],
         "statement": f"On {axes_text(one.axes)} {what}, and no known effect says why{beside} ({chance(p_value)}).",
     }
+
+
+def motion_tables(claims: Sequence[Claim], reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One mismatch for every axis whose moving stretches were left out of the comparison, from the first of them to the last."""
+    if "moving" not in reduced:
+        return []
+    begin, end, block = reduced["begin"].values, reduced["end"].values, float(reduced.attrs["block_s"])
+    out: list[dict[str, Any]] = []
+    for axis, moving, mean in zip(
+        map(str, reduced["axis"].values), reduced["moving"].values, measured(reduced, "mean").values, strict=True
+    ):
+        if not moving.any():
+            continue
+        first, last = (float(edge) for edge in (begin[moving][0], end[moving][-1]))
+        largest = float(np.nanmax(np.abs(mean - np.nanmedian(mean[~moving]))[moving]))
+        out.append(
+            {
+                "id": len(known) + len(out) + 1,
+                "view": "mean",
+                "axes": [axis],
+                "start": iso(reduced, first),
+                "end": iso(reduced, last),
+                "tau_min_s": 1.0 / float(reduced.attrs["sampling_rate_hz"]),
+                "tau_max_s": max((last - first) / 2.0, block),
+                "ratio": None,
+                "p_value": _LEAST_P,
+                "explained_by": [],
+                "statement": motion_statement(axis, span_text(first, last, float(end[-1])), largest, _followers(axis, claims)),
+            }
+        )
+    return out
+
+
+def _followers(axis: str, claims: Sequence[Claim]) -> list[str]:
+    """Axes on which the rate of an axis is seen through a lean of theirs."""
+    parts = [part for claim in claims if claim.effect == "misalignment" for part in claim.parts]
+    return sorted({name for part in parts if axis in (*part.variant.columns, *part.candidate.witness) for name in part.row})
 
 
 def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[str, Any]]:

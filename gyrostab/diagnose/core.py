@@ -21,6 +21,7 @@ from gyrostab.diagnose.content import (
     limit_tables,
     mismatch_tables,
     model_tables,
+    motion_tables,
     recording_table,
     surfaces_with_blocks,
     unknown_tables,
@@ -29,6 +30,7 @@ from gyrostab.diagnose.content import (
 from gyrostab.diagnose.ensemble import null_records
 from gyrostab.diagnose.evidence import held_out
 from gyrostab.diagnose.locate import locate
+from gyrostab.diagnose.moving import unexplained_motion, without_motion
 from gyrostab.diagnose.name import Naming, name_effects
 from gyrostab.diagnose.null_scores import NullScores, null_scores
 from gyrostab.diagnose.recalibrate import recalibrate, with_noise
@@ -135,14 +137,22 @@ def _diagnose(
     if len(alive) < log.sizes["axis"]:
         reduced = reduce_log(log.sel(axis=alive), block=block, restart_gap=restart_gap, progress=progress)
         given = given.sel(axis=alive) if isinstance(given, xr.Dataset) else given
-    progress("calibrating", 0)
-    baseline = _baseline(reduced, given, quiet, restart_gap, progress)
-    records = _records(reduced, baseline, nulls, seed)
-    progress("comparing", 0)
-    null = null_scores(baseline, records())
-    found = locate(reduced, baseline, null, level=level / 2.0)  # the other half is for the names
-    progress("naming", 0)
-    naming = name_effects(reduced, baseline, records(), level=level / 2.0, seed=seed, progress=progress)
+
+    def compared(reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset, Naming, NullScores]:
+        progress("calibrating", 0)
+        baseline = _baseline(reduced, given, quiet, restart_gap, progress)
+        records = _records(reduced, baseline, nulls, seed)
+        progress("comparing", 0)
+        null = null_scores(baseline, records())
+        found = locate(reduced, baseline, null, level=level / 2.0)  # the other half is for the names
+        progress("naming", 0)
+        return baseline, found, name_effects(reduced, baseline, records(), level=level / 2.0, seed=seed, progress=progress), null
+
+    baseline, found, naming, null = compared(reduced)
+    moving = unexplained_motion(reduced, naming.claims) if given is None else np.zeros(1, np.bool_)
+    if moving.any():
+        reduced = without_motion(log.sel(axis=alive), reduced, moving, restart_gap=restart_gap, progress=progress)
+        baseline, found, naming, null = compared(reduced)
     progress("fitting", 0)
     own = given if isinstance(given, Model) else None
     return _concluded(reduced, baseline, found, naming, null, level=level, given=own, begun=begun)
@@ -243,6 +253,7 @@ def _concluded(
     mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level / 2.0))
     mismatches += claim_tables(naming, reduced, mismatches)
     mismatches += unknown_tables(naming, reduced, mismatches)
+    mismatches += motion_tables(naming.claims, reduced, mismatches)
     unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
     content = {
         "schema": SCHEMA,

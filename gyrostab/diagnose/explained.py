@@ -12,6 +12,7 @@ from gyrostab.diagnose.candidates import Candidate, Variant
 from gyrostab.diagnose.cells import State, harmonic_sets, order_columns, pair_rows, power_column
 from gyrostab.diagnose.gain import noise_columns
 from gyrostab.diagnose.lines import line_skirt
+from gyrostab.diagnose.reduced import measured
 from gyrostab.diagnose.response import is_filter, straightened
 from gyrostab.physics.phase import fold
 
@@ -185,7 +186,7 @@ def _comb(state: State) -> NDArray[np.bool_]:
 def _transfer(state: State, part: Part) -> State:
     axis, name = part.row[0], part.candidate.witness[0]
     if name in state.axes:
-        power = state.reduced["power"].sel(axis=name).transpose("block", "band").values
+        power = measured(state.reduced, "power").sel(axis=name).transpose("block", "band").values
     else:
         place = [str(one) for one in state.reduced["witness"].values].index(name)
         power = state.reduced["witness_power"].transpose("witness", "block", "band").values[place]

@@ -50,6 +50,8 @@ def _restlessness(reduced: xr.Dataset) -> dict[str, Array]:
             slope = np.abs(np.gradient(smooth, step))
             scatter = float(np.median(np.abs(np.diff(filled, 2)))) / (5.0 * step)  # of the slope, by noise and by digits
             found[name] = slope / max(0.3 * float(np.quantile(slope, 0.95)), 3.0 * scatter, np.finfo(float).tiny)
+    if "moving" in reduced:
+        found["motion"] = np.where(reduced["moving"].values.any(axis=0), 2.0, 0.0)  # more than 1: not at rest
     if reduced.sizes.get("restart", 0):
         since = reduced["begin"].values[:, None] - reduced["restart_end"].values
         since = np.where(since < -step, np.inf, np.maximum(since, 1.0)).min(axis=1)

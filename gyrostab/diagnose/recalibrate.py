@@ -16,6 +16,7 @@ from gyrostab.diagnose.claims import Naming
 from gyrostab.diagnose.expected import common_variance, noise_powers, white_variance
 from gyrostab.diagnose.explained import Part, explain_away, take_part
 from gyrostab.diagnose.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior
+from gyrostab.diagnose.reduced import measured
 from gyrostab.diagnose.refit import FORM_ERROR, Fitted
 from gyrostab.diagnose.response import is_filter, response_of
 from gyrostab.diagnose.sizes import part_mixture
@@ -169,7 +170,7 @@ def _followed(part: Part, state: State) -> Array:
     """Power that follows a channel or another axis, (block, band)."""
     name = part.candidate.witness[0]
     if name in state.axes:
-        power = state.reduced["power"].sel(axis=name).transpose("block", "band").values
+        power = measured(state.reduced, "power").sel(axis=name).transpose("block", "band").values
     else:
         place = [str(one) for one in state.reduced["witness"].values].index(name)
         power = state.reduced["witness_power"].transpose("witness", "block", "band").values[place]

@@ -18,7 +18,7 @@ from gyrostab.timegrid import grid_index, grid_times
 from gyrostab.units import INNER
 from gyrostab.windows import duration_seconds, samples
 
-__all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "reduce_log"]
+__all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "reduce_log"]
 
 Array = NDArray[np.float64]
 _BLOCK_S, _FEWEST, _MOST, _LEAST_SAMPLES, _MUST = 20.0, 90, 6000, 100, 24
@@ -77,7 +77,14 @@ def _smooth(length: int) -> int:
         length -= 1
 
 
-def reduce_log(log: xr.Dataset, *, block: Any = None, restart_gap: Any = 5.0, progress: Stage = no_stage) -> xr.Dataset:
+def reduce_log(
+    log: xr.Dataset,
+    *,
+    block: Any = None,
+    restart_gap: Any = 5.0,
+    left_out: NDArray[np.bool_] | None = None,
+    progress: Stage = no_stage,
+) -> xr.Dataset:
     """Reduce a log to what the diagnosis works on: means, band powers and counts of blocks of equal length.
 
     Parameters
@@ -88,6 +95,8 @@ def reduce_log(log: xr.Dataset, *, block: Any = None, restart_gap: Any = 5.0, pr
         Length of a block [s]; 20 s, or less in short records, by default.
     restart_gap : str or float
         Gap from which on the power is taken to have been off [s].
+    left_out : ndarray of bool, shape (axis, block), optional
+        Blocks that count as missing on an axis.
     progress : Stage
         Is told of the progress, in samples over all axes.
 
@@ -128,9 +137,16 @@ def reduce_log(log: xr.Dataset, *, block: Any = None, restart_gap: Any = 5.0, pr
     rows = row_count(log)
     progress("reducing", rows * work.blocks * length)
     for stretch in read_stretches(log, length):
+        if left_out is not None:
+            stretch.values[: work.axes][left_out[:, stretch.first : stretch.first + stretch.values.shape[1]]] = np.nan
         work.add(stretch)
         progress("reducing", rows * work.blocks * length, rows * (stretch.first + stretch.values.shape[1]) * length)
     return _labelled(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
+
+
+def measured(reduced: xr.Dataset, name: str) -> xr.DataArray:
+    """A variable of the reduced record as the axes measured it, with what of it is left out because they moved."""
+    return reduced[f"measured_{name}"] if f"measured_{name}" in reduced else reduced[name]
 
 
 def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:

@@ -17,6 +17,7 @@ __all__ = [
     "effect_statement",
     "length_text",
     "mismatch_statement",
+    "motion_statement",
     "named_statement",
     "next_measurement",
     "plain_name",
@@ -161,6 +162,22 @@ def clock(seconds: float) -> str:
     hours, minute = divmod(minutes, 60)
     tail = f"{second:02d}" + (f".{int(rest)}" if rest and seconds < 60 else "")
     return f"{hours}:{minute:02d}:{tail}" if hours else f"{minute}:{tail}"
+
+
+def motion_statement(axis: str, when: str, largest: float, followers: Sequence[str]) -> str:
+    """Sentence for an axis that moves far above its noise [deg/h], with nothing in the record to say why.
+
+    Examples
+    --------
+    >>> motion_statement("z", "from 1 min to 5 min after the start", 389.0, ["x"])[-95:]
+    'xis x sees a share of it, so it is real rotation of the tool, whose true rate no channel tells.'
+    """
+    told = f"The rate of axis {axis} moves far above its noise {when}, by {largest:.3g} deg/h at most"
+    if followers:
+        sees = "sees a share" if len(followers) == 1 else "see shares"
+        return f"{told}; {axes_text(followers)} {sees} of it, so it is real rotation of the tool, whose true rate no channel tells."
+    near = " or ".join(plain_name(name) for name in ("real_motion", "scale_factor"))
+    return f"{told}, and no channel says why; it may be {near}."
 
 
 def span_text(begin: float, end: float, whole: float) -> str:

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gyrostab.diagnose.candidates import LARGEST
 from gyrostab.diagnose.cells import State
 from gyrostab.diagnose.explained import Part
+from gyrostab.diagnose.reduced import measured
 
 __all__ = ["PLAINER", "STRUCTURAL", "possible", "structural"]
 
@@ -19,8 +21,6 @@ STRUCTURAL: dict[str, tuple[str, ...]] = {
 }
 #: Effect -> effect that it becomes where a parameter goes to its end: without play, hysteresis is proportional to temperature.
 PLAINER = {"thermal_hysteresis": "temperature_bias"}
-#: Effect -> largest size that is plausible, of each of its parameters.
-_LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
 _SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
 _COMB = 3  # lines that may be one comb
 _MOVING = 1.5  # times the expected power, from which on an axis moves
@@ -40,8 +40,8 @@ def _possible(part: Part, state: State) -> bool:
         return False
     if effect == "fringe_hop" and abs(part_size(part, state)[0]) * np.abs(part.variant.design).max() < _SMALLEST_FRINGE:
         return False
-    if effect in _LARGEST and part.variant.columns[0] != "any":
-        return bool(np.abs(part_mixture(part, state).moments()[0]).max() <= _LARGEST[effect])
+    if effect in LARGEST and part.variant.columns[0] != "any":
+        return bool(np.abs(part_mixture(part, state).moments()[0]).max() <= LARGEST[effect])
     return not (part.variant.squared and view == "power" and part_size(part, state)[0] <= 0.0)
 
 
@@ -49,7 +49,7 @@ def _moves(axis: str, state: State) -> bool:
     """Whether an axis shows more than its noise at some frequency: what is at rest cannot leak in."""
     row = state.axes.index(axis)
     expected = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
-    return bool(np.nanmax(np.nanmean(state.reduced["power"].values[row] / expected, axis=0)) > _MOVING)
+    return bool(np.nanmax(np.nanmean(measured(state.reduced, "power").values[row] / expected, axis=0)) > _MOVING)
 
 
 def structural(effect: str, parts: Sequence[Part], state: State, *, lines: int = 0) -> list[str]:

@@ -1,0 +1,109 @@
+"""Axes that turn far above their noise: where they do, and that it stays out of what is calibrated and compared."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline import calibrate
+from gyrostab.diagnose.candidates import windows_of
+from gyrostab.diagnose.content import motion_tables
+from gyrostab.diagnose.moving import moving_blocks, unexplained_motion, without_motion
+from gyrostab.diagnose.reduced import measured, reduce_log
+from gyrostab.simulate import simulate
+
+N = 0.01
+BEGIN, END = 2000, 4000  # samples in which z turns
+
+
+@pytest.fixture(scope="module")
+def still() -> xr.Dataset:
+    return simulate({"log": {"axes": ["x", "y", "z"]}, "noise": {"N": N}}, duration="20min", rate=10.0, seed=5)
+
+
+@pytest.fixture(scope="module")
+def turning(still) -> xr.Dataset:
+    log = still.copy(deep=True)
+    bump = np.zeros(log.sizes["time"])
+    bump[BEGIN:END] = 400.0 * np.sin(np.pi * np.linspace(0.0, 1.0, END - BEGIN)) ** 2
+    rate = log["rate"].transpose("axis", "time").values
+    rate[2] += bump
+    rate[0] += 0.7e-3 * bump
+    return log.assign(rate=(("axis", "time"), rate, log["rate"].attrs))
+
+
+@pytest.fixture(scope="module")
+def seen(turning) -> tuple[xr.Dataset, xr.Dataset]:
+    whole = reduce_log(turning)
+    return whole, without_motion(turning, whole, moving_blocks(whole))
+
+
+def test_noise_and_drift_do_not_move(still):
+    assert not moving_blocks(reduce_log(still)).any()
+    ramp = np.linspace(0.0, 500.0, still.sizes["time"])
+    assert not moving_blocks(reduce_log(still.assign(rate=still["rate"] + xr.DataArray(ramp, dims="time")))).any()
+
+
+def test_the_axis_that_turns_is_found_where_it_does(seen):
+    whole, _ = seen
+    moving = moving_blocks(whole)
+    length = whole.attrs["block_samples"]
+    assert not moving[:2].any()
+    inside = np.flatnonzero(moving[2])
+    assert abs(inside[0] - BEGIN / length) <= 3
+    assert abs(inside[-1] + 1 - END / length) <= 3
+    assert np.diff(inside).max() == 1
+
+
+def test_what_turns_most_of_the_time_has_no_rest(turning):
+    rate = turning["rate"].transpose("axis", "time").values.copy()
+    rate[2, 3000:] += 400.0 * np.arange(rate.shape[1] - 3000) / 1000.0
+    assert not moving_blocks(reduce_log(turning.assign(rate=(("axis", "time"), rate, turning["rate"].attrs))))[2].any()
+
+
+def test_left_out_on_the_axis_alone_and_kept_as_measured(seen):
+    whole, rest = seen
+    moving = rest["moving"].values
+    assert np.isnan(rest["mean"].values[moving]).all()
+    assert np.isnan(rest["power"].values[moving]).all()
+    np.testing.assert_array_equal(rest["mean"].values[:2], whole["mean"].values[:2])
+    np.testing.assert_array_equal(measured(rest, "mean"), whole["mean"])
+    np.testing.assert_array_equal(measured(rest, "cross"), whole["cross"])
+    np.testing.assert_array_equal(windows_of(rest, {}).own["z"], whole["mean"].sel(axis="z"))
+    assert rest.sizes["gap"] == whole.sizes["gap"]
+
+
+def test_the_noise_is_that_of_the_rest(seen):
+    _, rest = seen
+    baseline = calibrate(rest)
+    error = (baseline["coefficient"].sel(term="N") - N) / baseline["stderr"].sel(term="N")
+    assert (np.abs(error) < 4.0).all()
+    assert not baseline["quiet"].values[:, rest["moving"].values.any(axis=0)].any()
+    assert (baseline["coefficient"].sel(term="K") < 1.0).all()
+
+
+def claim(effect: str, view: str, *row: str, column: str = "z") -> SimpleNamespace:
+    variant, candidate = SimpleNamespace(columns=(column,)), SimpleNamespace(view=view, witness=())
+    return SimpleNamespace(effect=effect, parts=(SimpleNamespace(candidate=candidate, row=row, variant=variant),))
+
+
+def test_a_named_effect_on_its_means_explains_the_motion(seen):
+    whole, _ = seen
+    assert not unexplained_motion(whole, [claim("warm_up", "mean", "z")]).any()
+    for other in (claim("warm_up", "mean", "x"), claim("light_power_noise", "power", "z")):
+        np.testing.assert_array_equal(unexplained_motion(whole, [other]), moving_blocks(whole))
+
+
+def test_one_mismatch_says_where_it_moves_and_who_sees_it(seen):
+    whole, rest = seen
+    assert motion_tables([], whole, []) == []
+    (alone,) = motion_tables([], rest, [{}])
+    assert (alone["id"], alone["axes"], alone["explained_by"]) == (2, ["z"], [])
+    assert "scale-factor" in alone["statement"]
+    assert "40" in alone["statement"] or "39" in alone["statement"]
+    (witnessed,) = motion_tables([claim("misalignment", "mean", "x")], rest, [])
+    assert "axis x sees a share" in witnessed["statement"]
+    assert "real rotation" in witnessed["statement"]
