@@ -284,6 +284,31 @@ def test_channels_are_averaged_over_blocks_whatever_their_own_time():
     assert reduced.channel_vibration.values == pytest.approx(np.sqrt(12.5))
 
 
+@pytest.mark.parametrize("own", [True, False], ids=["on stamps of its own", "with the rate"])
+def test_temperatures_keep_their_course_inside_of_blocks_and_lose_their_noise(own):
+    rng = np.random.default_rng(4)
+    log = log_of(rng.standard_normal(180_000))
+    t = np.arange(180_000) / RATE
+    true = 20.0 + np.clip(t - 801.0, 0.0, 400.0) / 30.0
+    every = 100 if own else 1
+    seen = true[::every] + (0.1 if own else 1.0) * rng.standard_normal(t[::every].size)
+    if own:
+        log["temperature"] = ("time_temperature", seen, {"units": "degree_Celsius"})
+        log = log.assign_coords(time_temperature=log.time.values[::every])
+    else:
+        log["temperature"] = ("time", seen, {"units": "degree_Celsius"})
+    log["temperature_2"] = ("time_temperature_2", true[::900], {"units": "degree_Celsius"})
+    log = log.assign_coords(time_temperature_2=log.time.values[::900])
+    reduced = reduce_log(log)
+    fine = reduced.fine_temperature
+    assert fine.dims == ("block", "piece")
+    assert fine.attrs["units"] == "degree_Celsius"
+    error = fine.values - true.reshape(*fine.shape, -1).mean(axis=2)
+    raw = 0.1 / np.sqrt(180_000 / every / fine.size) * (1.0 if own else 10.0)
+    assert error.std() < 0.6 * raw
+    assert "fine_temperature_2" not in reduced  # slower than the parts
+
+
 def test_a_channel_that_falls_silent_is_missing_there():
     log = log_of(np.random.default_rng(0).standard_normal(60_000))
     stamps = log.time.values[::100]

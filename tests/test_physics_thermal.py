@@ -112,6 +112,31 @@ def test_shupe_is_invisible_at_a_steady_ramp_and_a_step_where_it_begins():
     np.testing.assert_allclose(surface.window_mean.values[[0, 3, 5]], [0.0, 0.2, 0.2], atol=1e-9)
 
 
+def test_a_ramp_seen_through_a_late_sensor_is_felt_when_it_begins():
+    """T as a sensor of 40 s shows a ramp that begins at 0: the winding of one mode follows the true ramp, ``v (1 - exp(-t / lag))``."""
+    rate, lag, late, v = 10.0, 60.0, 40.0, 2.0
+    t = np.arange(6000) / rate
+    seen = 20.0 + v / 60.0 * (t - late * -np.expm1(-t / late))
+    table = {"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": lag}
+    expected = 0.4 * v * -np.expm1(-t / lag)
+    found = run(make_effect(table | {"sensor_lag": late}), size=t.size, rate=rate, drivers={"temperature": seen})[0]
+    np.testing.assert_allclose(found, expected, atol=0.002 * expected.max())
+    without = run(make_effect(table), size=t.size, rate=rate, drivers={"temperature": seen})[0]
+    assert np.abs(without - expected).max() > 0.2 * expected.max()
+
+
+def test_a_step_seen_through_a_late_sensor_is_a_step_of_the_surface():
+    """A winding of one mode reads ``D / lag exp(-t / lag)`` after a step D of its surface."""
+    rate, lag, late, step = 20.0, 60.0, 40.0, 5.0
+    t = np.arange(12_000) / rate
+    seen = 20.0 - step * np.expm1(-np.maximum(t - 100.0, 0.0) / late)
+    effect = make_effect({"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": lag, "sensor_lag": late})
+    found = run(effect, size=t.size, rate=rate, drivers={"temperature": seen})[0]
+    expected = 0.4 * 60.0 * step / lag * np.exp(-(t - 100.0) / lag) * (t > 100.0)
+    away = np.abs(t - 100.0) > 0.2
+    np.testing.assert_allclose(found[away], expected[away], atol=0.003 * expected.max())
+
+
 def test_shupe_refuses_parts_of_modes_and_halves_of_one():
     with pytest.raises(OptionError, match=r"'modes': 2\.5 is not a whole number of modes"):
         make_effect({"name": "shupe", "sensitivity": 1, "modes": 2.5})

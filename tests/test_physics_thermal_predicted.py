@@ -53,6 +53,8 @@ def generated(effect, **noise):
         {"name": "shupe", "sensitivity": 1.0},
         {"name": "shupe", "sensitivity": 0.0, "transient": 1.0},
         {"name": "shupe", "sensitivity": 1.0, "modes": 1, "lag": 1000},
+        {"name": "shupe", "sensitivity": 1.0, "lag": 600, "sensor_lag": 40},
+        {"name": "shupe", "sensitivity": 0.5, "transient": 1.0, "lag": 600, "sensor_lag": 40},
         {"name": "thermal_gradient", "sensitivity": 1.0},
         {"name": "thermal_gradient", "change": 1.0, "lag": 120},
         {"name": "warm_up", "amplitude": 1.0, "time": 300},
@@ -80,6 +82,7 @@ def test_predicted_window_means_are_the_generated_ones(table):
         found = np.array([bias[row].mean() for row in rows])
         good[:] = True
     good[0] = table["name"] == "warm_up"  # what happened before the middle of the first window is not known to the prediction
+    good[-1] = "sensor_lag" not in table  # nor how the change goes on after the middle of the last one
     spread = np.ptp(found[good])
     assert spread > 0
     np.testing.assert_allclose(predicted[good], found[good], atol=(0.05 if effect.name == "thermal_hysteresis" else 0.02) * spread)
@@ -137,8 +140,34 @@ def test_delayed_changes_add_up_to_what_the_lag_let_through(lag, count, seed):
     assert np.sum(means * (end - begin)) == pytest.approx(values[-1] - values[0], abs=1e-6)
 
 
+@pytest.mark.parametrize("table", [{"lag": 300, "sensor_lag": 40}, {"lag": 300}, {"lag": 30, "modes": 1, "sensor_lag": 60}], ids=str)
+def test_fine_values_sharpen_what_the_change_of_temperature_does(table):
+    """Windows of 60 s see a corner of the temperature between two of them only in values inside of them."""
+    warm = 20.0 + 2.0 / 60.0 * np.clip(_T - 3000.0, 0.0, 1200.0)
+    effect = make_effect({"name": "shupe", "sensitivity": 1.0} | table)
+    found = run(effect, size=_T.size, rate=RATE, drivers={"temperature": warm})[0].reshape(-1, 120).mean(axis=1)
+    begin = np.arange(0.0, LENGTH, 60.0)
+    means = {"temperature": warm.reshape(-1, 120).mean(axis=1)}
+    blunt = Windows(begin, begin + 60.0, np.ones(1), RATE, ("x",), drivers=means)
+    sharp = replace(blunt, fine={"temperature": warm.reshape(-1, 12, 10).mean(axis=2)})
+    off = [np.abs(effect.explain(one).mean["sensitivity"] - found).max() for one in (blunt, sharp)]
+    assert off[1] < 0.15 * found.max()
+    assert off[1] < 0.4 * off[0]
+
+
+def test_windows_that_overlap_know_only_their_means():
+    begin, means = np.array([0.0, 30.0]), np.array([1.0, 2.0])
+    windows = Windows(begin, begin + 60.0, np.ones(1), RATE, ("x",), drivers={"a": means}, fine={"a": np.ones((2, 4))})
+    at, values = windows.course("a")
+    np.testing.assert_array_equal(at, [30.0, 60.0])
+    np.testing.assert_array_equal(values, means)
+    at, values = replace(windows, end=begin + 30.0).course("a")
+    np.testing.assert_allclose(at, 3.75 + 7.5 * np.arange(8))
+
+
 CASES = [
     {"name": "shupe", "sensitivity": 0.05, "transient": -0.3, "lag": 20},
+    {"name": "shupe", "sensitivity": 0.05, "transient": -0.3, "lag": 20, "sensor_lag": 15},
     {"name": "thermal_gradient", "sensitivity": 0.05, "change": 0.2},
     {"name": "warm_up", "amplitude": 0.3, "slow_amplitude": 0.1, "gap": 2.0, "cooling": 30},
     {"name": "thermal_hysteresis", "sensitivity": 0.01, "width": 0.5},
@@ -151,7 +180,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("table", CASES, ids=lambda table: table["name"])
+@pytest.mark.parametrize("table", CASES, ids=lambda table: "-".join(map(str, table.values())))
 @given(st.integers(0, 2**31), st.sampled_from([0.3, 10.0, 977.0]))
 @settings(max_examples=8, deadline=None)
 def test_time_may_be_cut_anywhere(table, seed, rate):
@@ -188,6 +217,7 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
     ("table", "words"),
     [
         ({"name": "shupe", "sensitivity": 0.1, "transient": 0.2}, r"0.2 deg/h/\(degC/min\) while heat goes through the winding"),
+        ({"name": "shupe", "sensitivity": 0.1, "sensor_lag": 40}, "with a lag of 265 s, seen by a sensor that is 40 s late"),
         ({"name": "shupe", "sensitivity": 0.0, "transient": 0.2}, r"temperature on all axes, by 0.2 deg/h/\(degC/min\) while heat goes"),
         ({"name": "temperature_bias", "sensitivity": 0.0, "cubic": 1e-6}, r"on all axes, by 1e-06 deg/h/degC\^3 around 25 degC"),
         ({"name": "temperature_bias", "sensitivity": 0.1, "cubic": 1e-6}, r"by 0.1 deg/h/degC, 1e-06 deg/h/degC\^3 around 25 degC"),

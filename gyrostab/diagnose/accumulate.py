@@ -17,11 +17,13 @@ from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.timegrid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
-__all__ = ["HARMONICS", "PARTS", "PHASES", "Accumulator"]
+__all__ = ["FINE", "HARMONICS", "PARTS", "PHASES", "Accumulator"]
 
 Array = NDArray[np.float64]
 #: Parts of the record with a line spectrum each; harmonics of the rotation; bins of the ramp's phase.
 PARTS, HARMONICS, PHASES = 8, (1, 2, 3), 40
+#: Parts of a block over which temperatures are averaged.
+FINE = 4
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
 _GAP_S = 1.0  # shorter gaps are not listed
 _FOR_LATTICE = 64  # blocks whose values are kept
@@ -58,6 +60,7 @@ class Accumulator:
         self.line_sum = np.zeros((self.axes, PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, PARTS, 2))
+        self.fine = {name: np.full((blocks, FINE), np.nan) for name in self.beside if name.startswith("temperature")}
         self.kept: list[Array] = []
         self.gaps: list[tuple[int, int]] = []
         self.open: int | None = None
@@ -84,6 +87,11 @@ class Accumulator:
         self._spectra(part, centred, present)
         self.adjacent[:, part] = np.count_nonzero(present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1)
         self._find_gaps(part, present[: self.axes])
+        for name, fine in self.fine.items():
+            row, edges = self.axes + self.beside.index(name), np.arange(FINE) * self.length // FINE
+            total = np.add.reduceat(np.where(present[row], stretch.values[row], 0.0), edges, axis=1)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                fine[part] = total / np.add.reduceat(present[row].astype(np.float64), edges, axis=1)
         every = max(1, self.blocks // _FOR_LATTICE)
         chosen = [number for number in range(part.start, part.stop) if number % every == 0]
         self.kept += [stretch.values[: self.axes, number - part.start, : 2**14 // _FOR_LATTICE].copy() for number in chosen]

@@ -76,6 +76,7 @@ def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         rate=float(reduced.attrs["sampling_rate_hz"]),
         axes=axes,
         drivers={inner: _bridged(reduced[f"channel_{name}"].values) for inner, name in drivers.items()},
+        fine={inner: reduced[f"fine_{name}"].values for inner, name in drivers.items() if f"fine_{name}" in reduced},
         own=own,
         gaps=spans("gap"),
         restarts=spans("restart"),

@@ -8,10 +8,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.accumulate import HARMONICS, PARTS, PHASES, Accumulator
+from gyrostab.diagnose.accumulate import FINE, HARMONICS, PARTS, PHASES, Accumulator
 from gyrostab.diagnose.outliers import count_outliers, lattice_step
 from gyrostab.diagnose.stretches import channel_means, numeric_channels, read_stretches, row_count, sample_count
 from gyrostab.errors import OptionError
+from gyrostab.kernels.smooth import smooth_curve
 from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import GAP_CAUSES, check_log
 from gyrostab.timegrid import grid_index, grid_times
@@ -22,6 +23,7 @@ __all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "reduce_
 
 Array = NDArray[np.float64]
 _BLOCK_S, _FEWEST, _MOST, _LEAST_SAMPLES, _MUST = 20.0, 90, 6000, 100, 24
+_SMOOTH = 2.0  # blocks over which the course of a temperature is smoothed at most
 _MEAN_SHARE = 0.1  # of a block that must be present for its mean
 _POWER = "degree2 hour-2 Hz-1"
 _RATE = INNER["rate"]
@@ -107,8 +109,8 @@ def reduce_log(
         ``repeats``, ``extremes``, ``zeros``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of
         its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band), ``witness_power``, ``witness_cross``,
         ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``, ``profile(axis, block, phase)``,
-        ``lattice(axis)``, ``channel_<name>(block)``, and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of
-        the blocks, ``frequency`` [Hz] of the bands.
+        ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of temperatures, and the gaps and restarts in
+        seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
     ------
@@ -178,7 +180,7 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
         "line_power": (("axis", "part", "line"), lines, _named("mean periodogram at full resolution, two-sided density", _POWER)),
         "line_weight": (("axis", "part"), weight, _named("blocks in each mean, as many as equal ones would do", "1")),
     }
-    variables |= _beside(work, log) | _locked(work) | _channels(work, log) | _spans(work, log, restart)
+    variables |= _beside(work, log) | _locked(work) | _channels(work, log) | _fine(work, log) | _spans(work, log, restart)
     return xr.Dataset(variables, coords=_coordinates(work, log), attrs=_attributes(work, log, present)).set_coords(["first", "second"])
 
 
@@ -252,6 +254,27 @@ def _channels(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
             values = channel_means(log, name, edges, rms=rms)
         units = str(log[name].attrs.get("units", "1"))
         found[f"channel_{name}"] = ("block", values, _named(f"{'rms' if rms else 'mean'} of {name} over the block", units))
+    return found
+
+
+def _fine(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Temperatures in parts of the blocks, less their noise, where each part has a value of its own: effects follow their changes."""
+    found: dict[str, Any] = {}
+    edges = grid_times(work.start, work.rate, np.arange(work.blocks * FINE + 1) * work.length // FINE)
+    for name in numeric_channels(log)[1]:
+        if not name.startswith("temperature"):
+            continue
+        span = np.ptp(log[f"time_{name}"].values.astype("datetime64[ns]").astype(np.int64)) / 1e9
+        if log.sizes[f"time_{name}"] * work.length >= span * work.rate * FINE > 0.0:
+            work.fine[name] = channel_means(log, name, edges, rms=False).reshape(-1, FINE)
+    for name, values in work.fine.items():
+        good = np.isfinite(values)
+        if good.mean() > 1.0 / 2.0:
+            place = np.arange(values.size)
+            bridged = np.interp(place, place[good.ravel()], values[good])
+            units = str(log[name].attrs.get("units", "1"))
+            smooth = smooth_curve(bridged, longest=_SMOOTH * FINE).reshape(values.shape)
+            found[f"fine_{name}"] = (("block", "piece"), smooth, _named(f"{name} in parts of the block, without noise", units))
     return found
 
 

@@ -74,8 +74,8 @@ def _slid(part: Part, state: State, shift: int) -> Variant | None:
     candidate: Candidate = part.candidate
     reduced = state.reduced.copy()
     for name in filter(None, candidate.driver):
-        key = f"channel_{name}"
-        reduced[key] = reduced[key].copy(data=np.roll(reduced[key].values, shift))
+        for key in {f"channel_{name}", f"fine_{name}"} & set(map(str, reduced.data_vars)):
+            reduced[key] = reduced[key].copy(data=np.roll(reduced[key].values, shift, axis=0))
     made = variants_of(candidate, part.variant, reduced, state.baseline["coefficient"])
     return made
 

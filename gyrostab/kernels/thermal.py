@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["mean_changes", "mean_play", "play", "relax", "slab"]
+__all__ = ["mean_changes", "mean_play", "mean_rates", "play", "relax", "slab"]
 
 Array = NDArray[np.float64]
 
@@ -149,6 +149,28 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
     at, line = _joined(known, values, begin, end)
     followed = _follow(at, line, time)
     return np.asarray((followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin))
+
+
+def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
+    """Mean rate of change over intervals, from a few values of T that are joined by straight lines.
+
+    Parameters
+    ----------
+    known, values, begin, end : ndarray
+        As for `mean_changes`.
+
+    Returns
+    -------
+    ndarray, shape (w,)
+        Means of T' [unit of T s-1].
+
+    Examples
+    --------
+    >>> mean_rates(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]))
+    array([0.2, 0.2])
+    """
+    at, line = _joined(known, values, begin, end)
+    return np.asarray((line[np.searchsorted(at, end)] - line[np.searchsorted(at, begin)]) / (end - begin))
 
 
 def _joined(known: Array, values: Array, begin: Array, end: Array) -> tuple[Array, Array]:

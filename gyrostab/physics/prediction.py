@@ -29,6 +29,8 @@ class Windows:
         The axes looked at.
     drivers : mapping of str to ndarray, shape (window,)
         Channels averaged over each window, by the names of `Effect.channels`; vibration as the rms over the window.
+    fine : mapping of str to ndarray, shape (window, part)
+        Channels averaged over equal parts of each window and freed from noise, where they were sampled that often.
     own : mapping of str to ndarray, shape (window,)
         Measured rate of every axis of the log, averaged over each window [degree hour-1].
     gaps, restarts : ndarray, shape (n, 2)
@@ -45,6 +47,7 @@ class Windows:
     rate: float
     axes: tuple[str, ...]
     drivers: Mapping[str, Array] = field(default_factory=dict)
+    fine: Mapping[str, Array] = field(default_factory=dict)
     own: Mapping[str, Array] = field(default_factory=dict)
     gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
     restarts: Array = field(default_factory=lambda: np.empty((0, 2)))
@@ -55,6 +58,15 @@ class Windows:
     def centre(self) -> Array:
         """Middle of every window since the start of the log [s]."""
         return (self.begin + self.end) / 2.0
+
+    def course(self, *names: str) -> tuple[Array, ...]:
+        """Instants [s] and the values of channels then, as fine as all of them are known; windows that overlap have only their means."""
+        if not all(name in self.fine for name in names) or (self.begin[1:] < self.end[:-1]).any():
+            return self.centre, *(self.drivers[name] for name in names)
+        parts = self.fine[names[0]].shape[1]
+        share = (np.arange(parts) + 0.5) / parts
+        at = self.begin[:, None] + (self.end - self.begin)[:, None] * share
+        return at.ravel(), *(self.fine[name].ravel() for name in names)
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,8 @@ class Shupe(Effect):
     The coil is a winding that is heated from outside (T) and insulated inside. h is how the mean of the winding follows its surface: a sum
     of diffusion modes of the times ``lag / (2 n - 1)^2``, the slowest ``lag = 4 d^2 / (pi^2 kappa)`` for the thickness d. s is what is
     left of the winding's asymmetry, pure and elasto-optic in one; r what the outer half of the layers does against the inner one, while
-    heat is on its way.
+    heat is on its way. A sensor that is later than the surface by ``sensor_lag`` shows it a temperature of which the surface was
+    ``T + sensor_lag dT/dt``; layers that nearly cancel do the same, for they follow the second derivative.
 
     *DAVAR*: nothing at a steady ramp, for the bias is constant. Where a ramp of the rate v begins or ends the bias moves by s v within
     the lag: K = s v / sqrt(W) in windows W much longer than the lag, R of about s v / lag in short ones. *Window mean*: a plateau s v while
@@ -123,6 +124,9 @@ class Shupe(Effect):
     )
     lag: float = parameter("s", "relaxation time of the slowest mode", default=265.0, low=1e-3, high=1e6)
     modes: float = parameter("1", "number of modes; 1 for a simple lag", default=5.0, low=1.0, high=50.0)
+    sensor_lag: float = parameter(
+        "s", "by how much the sensor of the temperature is later than the surface of the winding", default=0.0, low=0.0, high=3600.0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -144,19 +148,26 @@ class Shupe(Effect):
             return np.zeros(0), state
         times, whole, halves = slab(self.lag, int(self.modes))
         before = (float(temperature[0]), np.zeros(times.size)) if state is None else state
-        felt, state = relax(temperature, chunk.rate, times, np.stack([whole, halves]), before)
+        change = np.diff(temperature, prepend=before[0]) * chunk.rate
+        ahead = self.sensor_lag / times  # (T' - v) / t is the lagged second derivative
+        felt, state = relax(temperature, chunk.rate, times, np.stack([whole, halves]) * (1.0 - ahead), before)
+        felt = felt + np.stack([whole @ ahead * change, halves @ ahead * change])
         return _MINUTE * (self.sensitivity * felt[0] + self.transient * felt[1]), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Lags from simple sensors to thick windings."""
-        return {"lag": np.geomspace(30.0, 3000.0, 9)}
+        """Lags from simple sensors to thick windings, beside sensors on the winding and off it."""
+        return {"lag": np.geomspace(30.0, 3000.0, 6), "sensor_lag": np.array([0.0, 20.0, 60.0])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means, from the window means of the temperature joined by straight lines."""
-        from gyrostab.kernels.thermal import slab
+        """Window means, from the temperature as finely as it is known, joined by straight lines."""
+        from gyrostab.kernels.thermal import mean_rates, slab
 
         times, whole, halves = slab(self.lag, int(self.modes))
-        modes = np.stack([_felt(windows, windows.drivers["temperature"], float(time)) for time in times])
+        at, temperature = windows.course("temperature")
+        modes = np.stack([_felt(windows, at, temperature, float(time)) for time in times])
+        if self.sensor_lag:
+            ahead = (self.sensor_lag / times)[:, None]
+            modes = (1.0 - ahead) * modes + ahead * _MINUTE * mean_rates(at, temperature, windows.begin, windows.end)
         return Prediction(mean={"sensitivity": whole @ modes, "transient": halves @ modes})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
@@ -164,14 +175,15 @@ class Shupe(Effect):
         terms = [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
         terms += [f"{self.quantity('transient', errors)} while heat goes through the winding"] if self.transient else []
         size = f"{' and '.join(terms)} with a lag of {self.quantity('lag', errors)}"
+        size += f", seen by a sensor that is {self.quantity('sensor_lag', errors)} late" if self.sensor_lag else ""
         return f"The bias follows the change of the temperature {self.on_axes()}, by {size}."
 
 
-def _felt(windows: Windows, values: Array, lag: float) -> Array:
-    """Window means of a delayed rate of change [unit of the values min-1]."""
+def _felt(windows: Windows, at: Array, values: Array, lag: float) -> Array:
+    """Window means of a delayed rate of change of values at instants [unit of the values min-1]."""
     from gyrostab.kernels.thermal import mean_changes
 
-    return _MINUTE * mean_changes(windows.centre, values, windows.begin, windows.end, lag)
+    return _MINUTE * mean_changes(at, values, windows.begin, windows.end, lag)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,7 +247,8 @@ class ThermalGradient(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """Window means of the difference and of its change."""
         difference = windows.drivers["temperature"] - windows.drivers["temperature_2"]
-        return Prediction(mean={"sensitivity": difference, "change": _felt(windows, difference, self.lag)})
+        at, one, other = windows.course("temperature", "temperature_2")
+        return Prediction(mean={"sensitivity": difference, "change": _felt(windows, at, one - other, self.lag)})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -300,10 +313,11 @@ class ThermalHysteresis(Effect):
         return {"width": np.ptp(windows.drivers["temperature"]) * np.array([0.01, 0.03, 0.1, 0.2, 0.33])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means, with the play run by the window means of the temperature joined by straight lines."""
+        """Window means, with the play run by the temperature as finely as it is known, joined by straight lines."""
         from gyrostab.kernels.thermal import mean_play
 
-        apart = mean_play(windows.centre, windows.drivers["temperature"], windows.begin, windows.end, self.width)
+        at, temperature = windows.course("temperature")
+        apart = mean_play(at, temperature, windows.begin, windows.end, self.width)
         return Prediction(mean={"sensitivity": apart})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
