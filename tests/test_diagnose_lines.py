@@ -132,3 +132,14 @@ def test_a_steady_line_leaves_no_error_of_its_form() -> None:
     chosen = [claim(part("spectral_line", "line", 900.0, 3)), claim(part("shupe", "mean", 400.0))]
     assert form_error([part("spectral_line", "line", 20.0, 9)], chosen, share=0.01) == 0.0
     assert form_error([part("warm_up", "mean", 20.0)], chosen, share=0.01) == pytest.approx(4.0)
+
+
+def test_the_spectrum_of_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
+    driven = replace(claim(part("vibration_noise", "power", 200.0)), driver=("vibration",))
+    steady = claim(part("relative_intensity_noise", "power", 200.0))
+    for chosen, effect, error in (
+        (driven, "logger_filter", 20.0),
+        (driven, "temperature_noise", 2.0),
+        (steady, "logger_filter", 2.0),
+    ):
+        assert form_error([part(effect, "power", 17.0)], [chosen], share=0.01) == pytest.approx(error)

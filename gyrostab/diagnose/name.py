@@ -272,10 +272,16 @@ class _Search:
         """What is chosen, and its claims with their last gains; without those that beside the others no longer reach their threshold."""
         while True:
             claims = {place: self._finished(start, one, chosen) for place, one in enumerate(chosen) if isinstance(one, Claim)}
-            weak = min(claims, key=lambda place: claims[place].gain - claims[place].threshold, default=None)
-            if weak is None or claims[weak].gain >= claims[weak].threshold:
+            spare = {place: one.gain - self._needed(one, claims) for place, one in claims.items()}
+            weak = min(spare, key=lambda place: spare[place], default=None)
+            if weak is None or spare[weak] >= 0.0:
                 return chosen, list(claims.values())
             chosen = [*chosen[:weak], *chosen[weak + 1 :]]
+
+    def _needed(self, claim: Claim, claims: dict[int, Claim]) -> float:
+        """What a claim must gain beside the others, whichever was named first."""
+        others = [one for one in claims.values() if one is not claim]
+        return max(claim.threshold, self.threshold + form_error(claim.parts, others, share=FORM))
 
     def _finished(self, start: State, claim: Claim, chosen: Sequence[Claim | Unknown]) -> Claim:
         """The claim with its gain and its rivals when all the others are in the model."""
