@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.trend import window_trend
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels
-from gyrostab.store.direct import can_fill, fill_row
+from gyrostab.store.direct import stretch
 from gyrostab.timegrid import first_stamp, grid_times
 from gyrostab.units import INNER
 
@@ -77,15 +77,6 @@ def window_channels(
     return out
 
 
-def _stretch(data: Any, low: int, high: int) -> NDArray[np.generic]:
-    """Values of a channel from `low` to `high`."""
-    if not can_fill(data):
-        return in_memory(data[low:high])
-    values = np.empty(high - low, data.dtype)
-    fill_row(data, 0, low, values)
-    return values
-
-
 def _trend(values: Any, stamps: NDArray[np.int64] | None, rate: float, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.float64]:
     data = np.ascontiguousarray(values, dtype=np.float64)
     seconds = np.arange(data.size) / rate if stamps is None else (stamps - stamps[:1]) / 1e9
@@ -113,6 +104,6 @@ def _means(
             one = dask.delayed(_trend, pure=False)(data[low:high], piece, rate, a - low, b - low)
             parts.append(da.from_delayed(one, (2, a.size), dtype=np.float64))
         else:
-            parts.append(_trend(_stretch(data, low, high), piece, rate, a - low, b - low))
+            parts.append(_trend(stretch(data, low, high), piece, rate, a - low, b - low))
     both = (da if lazy else np).concatenate(parts, axis=1)[:, kept.start - chosen[0].start : kept.stop - chosen[0].start]
     return both[0], both[1]

@@ -31,6 +31,8 @@ __all__ = ["davar", "davar_part", "davar_parts"]
 
 #: Samples of a part up to which all its axes are read together.
 _TOGETHER = 2**21
+#: Parts at least of a surface of so many units of work, for the threads to share.
+_LEAST_PARTS = 4
 
 
 def davar(
@@ -136,7 +138,7 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     log : xarray.Dataset
         Regular log.
     samples : int
-        Samples of a part over all axes; it gets one unit of work at least. Where windows are close, a part gets fewer.
+        Samples of a part over all axes; it gets one unit of work at least. Where windows are close, or units few, a part gets fewer.
     **options
         Options of `davar`.
 
@@ -156,7 +158,7 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     units = units_of_work(size, plan.unit)
     per_unit = max(1, units[0].stop - units[0].start)
     cells = axes * plan.unit.ks.size
-    together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit)))
+    together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit), -(-len(units) // _LEAST_PARTS)))
     edges = [number * len(units) // count for count in [-(-len(units) // together)] for number in range(count + 1)]
     return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
 

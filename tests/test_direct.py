@@ -15,9 +15,12 @@ from gyrostab.export import open_log
 from gyrostab.fit import fit_noise, fit_part
 from gyrostab.join import join_logs
 from gyrostab.join.lazy import lay
+from gyrostab.read.buffers import Spool, lazily
+from gyrostab.regularise import fill
+from gyrostab.regularise.place import Placement
 from gyrostab.run import checkpoint, load_log, run
 from gyrostab.store import read, write
-from gyrostab.store.direct import can_fill, fill_row
+from gyrostab.store.direct import can_fill, end_to_end, fill_row, held, one_row, stack_rows, stretch
 from gyrostab.store.header import read_header
 
 WINDOW = {"window": "40s", "step": "10s", "taus": "8"}
@@ -186,3 +189,51 @@ def test_logs_in_memory_join_as_before():
     found = np.empty(7)
     fill_row(joined, 0, 0, found)
     np.testing.assert_array_equal(found, joined.compute()[0])
+
+
+def placed_by_hand(runs, size, rows):
+    """The grid by its definition, sample by sample."""
+    out = np.full((len(rows), size), np.nan)
+    for sample, first, length in runs:
+        for i in range(length):
+            out[:, sample + i] = np.where(np.isinf(rows[:, first + i]), np.nan, rows[:, first + i])
+    return out
+
+
+@pytest.mark.parametrize("kept", ["memory", "disk", "both"])
+@pytest.mark.parametrize(("scale", "unit"), [(1.0, None), (3.0, None), (2.0, 0.1)])
+def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeypatch):
+    monkeypatch.setattr(fill, "SMALL", 10)
+    rng = np.random.default_rng(8)
+    rows = 0.1 * rng.integers(-50, 50, (2, 3000)).astype(float)
+    rows[0, 5], rows[1, 1200] = np.inf, np.nan
+    runs = np.array([[0, 0, 700], [705, 700, 1], [900, 800, 1000], [5000, 1900, 1100]])
+    spool, cut = Spool(), 1234
+    pieces = {"memory": [rows], "disk": [rows[:, :cut], rows[:, cut:]], "both": [rows[:, :cut], rows[:, cut:]]}[kept]
+    columns = [[lazily(spool.store(piece[row])) if kept == "disk" or (kept == "both" and number) else piece[row]
+                for number, piece in enumerate(pieces)] for row in (0, 1)]  # fmt: skip
+    raw = rows if kept == "memory" else stack_rows([end_to_end(column, 500) for column in columns])
+    placed = fill.on_grid(raw, Placement(0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit)
+    assert can_fill(placed)
+    expected = placed_by_hand(runs, 6100, rows)
+    if scale != 1.0:
+        expected = expected * scale if unit is None else np.rint(expected / unit) * (unit * scale)
+    np.testing.assert_array_equal(placed.compute(), expected)
+    for begin, end in [(0, 6100), (3, 4), (701, 705), (690, 910), (1850, 5001), (2000, 2000), (6000, 6100)]:
+        np.testing.assert_array_equal(stretch(placed, begin, end), expected[:, begin:end])
+    np.testing.assert_array_equal(stretch(one_row(placed, 1), 600, 1000), expected[1, 600:1000])
+
+
+def test_an_array_in_memory_is_not_copied():
+    values = np.arange(24.0).reshape(2, 12)
+    lazy = held(values, 5)
+    assert lazy.chunks == ((2,), (5, 5, 2))
+    np.testing.assert_array_equal(lazy.compute(), values)
+    values[1, 7] = -1.0
+    assert lazy[1, 7].compute() == stretch(lazy, 7, 8)[1, 0] == -1.0
+
+
+def test_columns_of_unlike_types_are_left_to_dask():
+    mixed = end_to_end([np.arange(3), held(np.arange(2.0), 10)], 10)
+    assert not can_fill(mixed)
+    np.testing.assert_array_equal(stretch(mixed, 2, 4), [2.0, 0.0])

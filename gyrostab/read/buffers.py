@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
+from gyrostab.store.direct import stack_rows, with_fill
 
 __all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "Spool", "Stored", "lazily", "put", "take", "together"]
 
@@ -83,17 +84,21 @@ class Stored:
 
     def __getitem__(self, part: Any) -> NDArray[Any]:
         rows = range(*(part[0] if isinstance(part, tuple) else part).indices(self.shape[0]))
-        out = np.empty(max(rows.stop - rows.start, 0), dtype=np.int64)
+        out = np.empty(max(rows.stop - rows.start, 0), dtype=self.dtype)
+        self.fill(0, rows.start, out)
+        return out[:: rows.step]
+
+    def fill(self, _row: int, begin: int, out: NDArray[Any]) -> None:
+        """The values from row `begin` of the log on: `gyrostab.store.direct.Fill`."""
+        values = out.view(np.int64)
         done = 0
-        while done < len(out):
-            row = rows.start + done
+        while done < len(values):
+            row = begin + done
             most = self._rows[bisect_right(self._rows, row)] - row
-            got = os.preadv(self.spool.handle, [out[done : done + most].data.cast("B")], self.place(row))
+            got = os.preadv(self.spool.handle, [values[done : done + most].data.cast("B")], self.place(row))
             if got < 8:
                 raise OSError("the temporary file of a long log is shorter than it was")
             done += got // 8
-        values: NDArray[Any] = out.view(self.dtype)
-        return values[:: rows.step]
 
 
 def take(column: NDArray[Any] | Stored, rows: NDArray[np.int64]) -> NDArray[Any]:
@@ -164,9 +169,7 @@ class Buffers:
 def together(columns: Sequence[Any]) -> Any:
     """Columns as the rows of one array, numpy if they are, without a copy if they are the rows of one already."""
     if not isinstance(columns[0], np.ndarray):
-        import dask.array
-
-        return dask.array.stack(columns)
+        return stack_rows(columns)
     whole = columns[0].base
     same = whole is not None and whole.ndim == 2 and len(whole) == len(columns) and all(column.base is whole for column in columns)
     return whole if same else np.stack(columns)
@@ -179,4 +182,4 @@ def lazily(values: NDArray[Any] | Stored) -> Any:
     import dask.array
 
     name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
-    return dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta)
+    return with_fill(dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta), values.fill)

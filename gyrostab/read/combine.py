@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.join import some, together
-from gyrostab.read.buffers import Spool, lazily
+from gyrostab.read.buffers import CHUNK_ROWS, Spool, lazily
 from gyrostab.read.overlap import drop_repeats
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store import common_packing
+from gyrostab.store.direct import end_to_end, one_row, stack_rows
 
 __all__ = ["attach_channels", "concatenate", "memory", "to_disk", "with_channels"]
 
@@ -29,7 +30,7 @@ def to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
 
     def moved(variable: xr.Variable) -> Any:
         values = variable.values
-        return lazily(spool.store(values)) if values.ndim == 1 else _dask().stack([lazily(spool.store(row)) for row in values])
+        return lazily(spool.store(values)) if values.ndim == 1 else stack_rows([lazily(spool.store(row)) for row in values])
 
     long = {name: variable for name, variable in part.variables.items() if name != "axis" and isinstance(variable._data, np.ndarray)}
     return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
@@ -107,7 +108,7 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
     data: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     if "time" in parts[0].variables:
-        coords["time"] = ("row", _end_to_end([part["time"].data for part in parts]))
+        coords["time"] = ("row", end_to_end([part["time"].data for part in parts], CHUNK_ROWS))
     if signal is not None:
         axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
         stack = _stacked(parts, signal, axes)
@@ -120,7 +121,7 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
         units = _channel_units(parts, channel)
         columns = [part[channel].data if channel in part else np.full(size, np.nan) for part, size in zip(parts, sizes, strict=True)]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
-        data[channel] = ("row", _end_to_end(columns), {"units": units}, packing)
+        data[channel] = ("row", end_to_end(columns, CHUNK_ROWS), {"units": units}, packing)
         absent[f"channel {channel}"] = [name for name, part in zip(names, parts, strict=True) if channel not in part]
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     gaps = [f"{what} is not in {some(files)} and is missing there" for what, files in absent.items() if files]
@@ -144,12 +145,12 @@ def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
             for axis in map(str, part["axis"].values):
                 whole[axes.index(axis), end - part.sizes["row"] : end] = part[signal].sel(axis=axis).data
         return whole
-    return _dask().stack([_end_to_end([_axis(part, signal, axis) for part in parts]) for axis in axes])
+    return stack_rows([end_to_end([_axis(part, signal, axis) for part in parts], CHUNK_ROWS) for axis in axes])
 
 
 def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
     if axis in part["axis"].values:
-        return part[signal].sel(axis=axis).data
+        return one_row(part[signal].data, [str(name) for name in part["axis"].values].index(axis))
     return np.full(part.sizes["row"], np.nan)
 
 
@@ -162,18 +163,6 @@ def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
             f"channel {channel!r} has different units: {listed}; give one with --unit {channel}=UNIT or drop it with --map {channel}=-"
         )
     return next(iter(units))
-
-
-def _end_to_end(columns: list[Any]) -> Any:
-    if all(isinstance(column, np.ndarray) for column in columns):
-        return np.concatenate(columns)
-    return _dask().concatenate([_dask().from_array(column, name=False) if isinstance(column, np.ndarray) else column for column in columns])
-
-
-def _dask() -> Any:
-    import dask.array
-
-    return dask.array
 
 
 def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:

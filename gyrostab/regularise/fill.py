@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import dask.array as da
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.stamps import NO_STAMP, RESTART, STEP
 from gyrostab.regularise.place import Placement
-from gyrostab.regularise.survey import BLOCK, in_memory
+from gyrostab.regularise.survey import BLOCK
+from gyrostab.store.direct import can_fill, fill_row, held, stretch, with_fill
 from gyrostab.timegrid import grid_times
 
 __all__ = ["SMALL", "gathered", "on_grid", "samples_of"]
@@ -25,10 +27,29 @@ def _fill(rows: NDArray[Any], *, runs: NDArray[np.int64], size: int, scale: floa
     out = np.full((*rows.shape[:-1], size), np.nan)
     for sample, row, length in runs:
         out[..., sample : sample + length] = rows[..., row : row + length]
+    return _scaled(out, scale, unit)
+
+
+def _scaled(out: NDArray[np.float64], scale: float, unit: float | None) -> NDArray[np.float64]:
+    """The samples themselves, changed: NaN where infinite, times their factor."""
     out[np.isinf(out)] = np.nan
     if scale != 1.0:
-        out = out * scale if unit is None else np.rint(out / unit) * (unit * scale)
+        out[...] = out * scale if unit is None else np.rint(out / unit) * (unit * scale)
     return out
+
+
+def _fill_samples(
+    rows: Any, runs: NDArray[np.int64], ends: NDArray[np.int64], scale: float, unit: float | None,
+    row: int, begin: int, out: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Samples of one row of the grid from `begin` on, as `_fill` makes them: `gyrostab.store.direct.Fill`."""
+    done = 0
+    for sample, first, length in _cut(runs, ends, begin, begin + out.size).tolist():
+        out[done:sample] = np.nan
+        done = sample + length
+        fill_row(rows, row, first, out[sample:done])
+    out[done:] = np.nan
+    _scaled(out, scale, unit)
 
 
 def _cut(runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int) -> NDArray[np.int64]:
@@ -62,7 +83,7 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, 
     size, lead = placement.size, rows.shape[:-1]
     if size * max(1, int(np.prod(lead))) <= SMALL:
         return _fill(np.asarray(rows), runs=placement.runs, size=size, scale=scale, unit=unit)
-    lazy = rows if isinstance(rows, da.Array) else da.from_array(rows, chunks=(*lead, BLOCK), name=False)
+    lazy = rows if isinstance(rows, da.Array) else held(np.asarray(rows), BLOCK)
     ends = placement.runs[:, 0] + placement.runs[:, 2]
     parts, empty = [], 0
 
@@ -85,7 +106,10 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, 
         shape = (*((n,) for n in lead), (end - begin,))
         parts.append(source.map_blocks(_fill, runs=runs, size=end - begin, scale=scale, unit=unit, dtype=np.float64, chunks=shape))
     flush()
-    return da.concatenate(parts, axis=-1)
+    placed = da.concatenate(parts, axis=-1)
+    if not can_fill(lazy) or lazy.dtype != np.float64:
+        return placed
+    return with_fill(placed, partial(_fill_samples, lazy, placement.runs, ends, scale, unit))
 
 
 def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -105,13 +129,13 @@ def gathered(raw: xr.Dataset, name: str, placement: Placement, rate: float) -> t
     moved = np.concatenate([[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]])
     stamps, values = [], []
     for begin in range(0, channel.shape[0], BLOCK):
-        block = in_memory(channel[begin : begin + BLOCK]).astype(np.float64, copy=False)
+        block = stretch(channel, begin, min(begin + BLOCK, channel.shape[0])).astype(np.float64, copy=False)
         rows = np.flatnonzero(np.isfinite(block))
         sample = samples_of(placement, rows + begin)
         known = sample >= 0
         when = grid_times(placement.start, rate, sample)
         if clock is not None and not known.all():
-            written = in_memory(clock[begin : begin + BLOCK]).astype("datetime64[ns]").view(np.int64)[rows]
+            written = stretch(clock, begin, min(begin + BLOCK, channel.shape[0])).astype("datetime64[ns]").view(np.int64)[rows]
             own = written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
             when = np.where(known, when, own)
             known |= written != NO_STAMP

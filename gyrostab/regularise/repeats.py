@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from gyrostab.kernels.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
 from gyrostab.regularise.fill import samples_of
 from gyrostab.regularise.place import Placement
-from gyrostab.regularise.survey import BLOCK, in_memory
+from gyrostab.regularise.survey import BLOCK
+from gyrostab.store.direct import stretch
 
 __all__ = ["find_repeats", "with_repeats"]
 
@@ -53,7 +54,7 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
 
 
 def _stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
-    return in_memory(raw["time"].data[begin:end]).astype("datetime64[ns]", copy=False).view(np.int64)
+    return stretch(raw["time"].data, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
 
 
 def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
@@ -83,7 +84,7 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
     changes = False
     for begin in range(0, length, BLOCK):
         end = min(begin + BLOCK, length)
-        left, right = (in_memory(raw[name].data[:, first + begin : first + end]) for first in (source, row))
+        left, right = (stretch(raw[name].data, first + begin, first + end) for first in (source, row))
         known = np.isfinite(left) & np.isfinite(right)
         rows = known.any(axis=0)
         told += int(rows.sum())

@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,8 +12,9 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.kernels.stamps import look
+from gyrostab.store.direct import stretch
 
-__all__ = ["BLOCK", "Survey", "blocks", "file_of", "in_memory", "survey"]
+__all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
 
 #: Rows that are held in memory at one time.
 BLOCK = 1 << 20
@@ -64,11 +64,6 @@ class Survey:
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
-def in_memory(values: Any) -> NDArray[Any]:
-    """A part of a column, computed here if it is lazy: handing it to threads takes longer than reading it."""
-    return np.asarray(values.compute(scheduler="synchronous") if hasattr(values, "compute") else values)
-
-
 def _spans(bad: NDArray[np.bool_], offset: int) -> NDArray[np.int64]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
@@ -102,7 +97,7 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
     filled = dict.fromkeys(channels, 0)
     for begin in range(0, rows, block):
         end = min(rows, begin + block)
-        cells = in_memory(signal[:, begin:end])
+        cells = stretch(signal, begin, end)
         present = np.empty(end - begin, dtype=bool)
         missing, holes, infinities, least, most = look(np.ascontiguousarray(cells, dtype=np.float64), present)
         absent += missing
@@ -113,7 +108,7 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
             infinite.append(_spans(np.isinf(cells).any(axis=0), begin))
         low, high = np.minimum(low, least), np.maximum(high, most)
         for key in channels:
-            filled[key] += int(np.isfinite(in_memory(raw[key].data[begin:end])).sum())
+            filled[key] += int(np.isfinite(stretch(raw[key].data, begin, end)).sum())
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
             f"{_sources(raw)}: none of the {rows} rows holds a number for any gyro axis; check the columns, the units and --map"
@@ -131,7 +126,7 @@ def blocks(
     stamps = raw["time"].data
     for begin in range(0, found.rows, block):
         end = min(found.rows, begin + block)
-        values = in_memory(stamps[begin:end]).astype("datetime64[ns]", copy=False).view(np.int64)
+        values = stretch(stamps, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
         if not found.repeated and (all_rows or found.absent == 0):
             yield np.arange(begin, end), values
         else:
