@@ -89,7 +89,8 @@ def test_no_axis_is_explained_by_its_own_reading(plain, found):
 
 def test_axes_at_rest_cannot_leak(plain, found):
     assert not [one for one in found[0] if one.effect == "misalignment" and one.view == "mean"]
-    turning = plain.assign(mean=plain["mean"] + xr.where(plain["axis"] == "z", 1.0, 0.0) * np.linspace(0.0, 500.0, plain.sizes["block"]))
+    course = xr.DataArray(np.linspace(0.0, 500.0, plain.sizes["block"]), dims="block")
+    turning = plain.assign(mean=plain["mean"] + course.where(plain["axis"] == "z", 0.0))
     leak = next(one for one in effect_candidates(turning, COEFFICIENT)[0] if one.effect == "misalignment" and one.view == "mean")
     assert [variant.columns for variant in leak.variants] == [("z",)]
 
