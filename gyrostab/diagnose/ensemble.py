@@ -157,8 +157,10 @@ def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator)
     reduced, baseline = frame.reduced, frame.baseline
     n, step = reduced.sizes["block"], float(reduced.attrs["block_s"])
     each = np.stack([white_variance(reduced, np.tile(unit, (len(slow[0]), 1))) for unit in np.eye(4)[:2]], axis=-1)
-    level = np.einsum("abn,ran->rab", each, squares[..., :2]) / np.einsum("abn,an->ab", each, baseline["square"].values[:, :2])
-    white = np.sqrt(_ordered(baseline, "mean_variance", "axis", "block") * np.where(np.isfinite(level), level, 1.0))
+    usual = np.einsum("abn,an->ab", each, baseline["square"].values[:, :2])
+    drawn = np.einsum("abn,ran->rab", each, squares[..., :2])
+    level = np.divide(drawn, usual, out=np.ones_like(drawn), where=np.broadcast_to(usual > 0.0, drawn.shape))  # an axis may have neither
+    white = np.sqrt(_ordered(baseline, "mean_variance", "axis", "block") * level)
     times = flicker_times(1.0 / step, low=1.0 / (2.0 * np.pi * 8.0 * n * step))
     total = _ordered(baseline, "known_mean", "axis", "block") + white * rng.standard_normal(white.shape)
     for place in np.ndindex(*white.shape[:2]):
