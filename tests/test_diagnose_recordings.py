@@ -76,7 +76,7 @@ def test_a_lattice_as_coarse_as_the_noise_tells_of_no_dead_zone(log_of: Callable
 
 
 def test_the_sway_of_the_platform_is_real_motion(log_of: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(log_of("rlg-static-30min", end=300.0), nulls=100)
+    found = gyrostab.diagnose(log_of("rlg-static-30min", end=180.0), nulls=100)
     assert "real_motion" in names(found)
     assert not {"dead_zone", "held_samples", "clipping"} & set(names(found))
 
