@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from gyrostab.diagnose.explained import explain_away
+from gyrostab.diagnose.explained import Part, explain_away
 from gyrostab.diagnose.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.lines import line_gains
 from gyrostab.diagnose.name import Claim, name_effects, tail_level
@@ -69,6 +70,17 @@ def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
     sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
     monkeypatch.setattr(sys.modules["gyrostab.diagnose.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
     assert possible([part, *elsewhere], state) == [part, elsewhere[1]]
+
+
+def test_sizes_beyond_what_the_registry_allows_are_impossible(shaken):
+    """A bias of 15 deg/h for each of some 40 degC is that of a broken instrument, or no effect of temperature."""
+    bias = next(one for one in shaken.candidates if one.effect == "temperature_bias" and one.view == "mean")
+    variant = next(one for one in bias.variants if one.columns == ("sensitivity",))
+    part = Part(bias, variant, ("y",), 50.0)
+    for size, answer in ((5.0, [part]), (15.0, [])):
+        state = shaken.state
+        mean = state.reduced["mean"] + size * xr.DataArray(variant.design[0, 0], dims="block").where(state.reduced["axis"] == "y", 0.0)
+        assert possible([part], replace(state, reduced=state.reduced.assign(mean=mean))) == answer
 
 
 @pytest.mark.parametrize(

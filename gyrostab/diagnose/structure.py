@@ -10,6 +10,7 @@ from gyrostab.diagnose.candidates import LARGEST
 from gyrostab.diagnose.cells import State
 from gyrostab.diagnose.explained import Part
 from gyrostab.diagnose.reduced import measured
+from gyrostab.physics.registry import effects
 
 __all__ = ["PLAINER", "STRUCTURAL", "possible", "structural"]
 
@@ -22,6 +23,7 @@ STRUCTURAL: dict[str, tuple[str, ...]] = {
 #: Effect -> effect that it becomes where a parameter goes to its end: without play, hysteresis is proportional to temperature.
 PLAINER = {"thermal_hysteresis": "temperature_bias"}
 _SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
+_SURE = 3.0  # standard errors beyond its range, from which on a size is impossible
 _COMB = 3  # lines that may be one comb
 _MOVING = 1.5  # times the expected power, from which on an axis moves
 _LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
@@ -42,7 +44,19 @@ def _possible(part: Part, state: State) -> bool:
         return False
     if effect in LARGEST and part.variant.columns[0] != "any":
         return bool(np.abs(part_mixture(part, state).moments()[0]).max() <= LARGEST[effect])
+    if view == "mean" and not _in_range(part, state):
+        return False
     return not (part.variant.squared and view == "power" and part_size(part, state)[0] <= 0.0)
+
+
+def _in_range(part: Part, state: State) -> bool:
+    """Whether the sizes of block means can lie where the registry allows the parameters: an instrument that has others is broken."""
+    from gyrostab.diagnose.sizes import part_mixture
+
+    largest = {item.name: max(abs(item.low), abs(item.high)) for item in effects()[part.candidate.effect].parameters()}
+    sizes, covariance = part_mixture(part, state).moments()
+    least = np.abs(sizes) - _SURE * np.sqrt(np.diagonal(covariance))
+    return all(size <= largest.get(name, np.inf) for name, size in zip(part.variant.columns, least, strict=True))
 
 
 def _moves(axis: str, state: State) -> bool:
