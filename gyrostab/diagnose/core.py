@@ -50,7 +50,6 @@ __all__ = ["diagnose", "quiet_span"]
 _KEPT = 3e8  # bytes of null records that are kept rather than drawn twice
 _AT_ONCE = 6.4e7  # bytes of band powers of the null records that are scored together
 _LEAST_NULLS = 100
-_ANOTHER = 0.05  # of N: a change that is no error of calibration
 _DEAD = 1e-20  # deg^2/h: a power that comes from rounding alone
 
 
@@ -242,7 +241,7 @@ def _concluded(
     first = fit_claims(naming, baseline)
     noise = recalibrate(naming, baseline, first)
     naming, raw = (naming, naming) if noise is baseline else (with_noise(naming, noise), naming)
-    fitted = fit_claims(naming, noise) if _differs(noise, baseline) else first
+    fitted = first if noise is baseline else fit_claims(naming, noise)
     after = predicted(naming, noise) if naming.claims else baseline
 
     def trained(known: NDArray[np.bool_]) -> xr.Dataset:
@@ -273,12 +272,6 @@ def _concluded(
     diagnosis = Diagnosis(plain(content), surfaces, model_tables(noise, fitted, given))
     check_diagnosis(diagnosis.content)
     return diagnosis
-
-
-def _differs(noise: xr.Dataset, baseline: xr.Dataset) -> bool:
-    """Whether white noise is another on some axis, so that sizes that are shares of it are others too."""
-    before, after = (one["coefficient"].sel(term="N").values for one in (baseline, noise))
-    return bool((np.abs(after - before) > _ANOTHER * before).any())
 
 
 def quiet_span(text: str) -> tuple[float | str, float | str]:

@@ -30,7 +30,7 @@ _GROUPS = 150  # of blocks of like level, over which powers are averaged
 _LEAST = 24  # blocks
 _BLURRED = 1e-4  # share of its information that N must keep beside the effects
 #: Parts whose power comes from what the effect says of itself, since their own view does not hold it.
-_SAID = ("cross", "marks")
+_SAID = {"cross", "marks"}
 
 
 @dataclass
@@ -143,7 +143,8 @@ def _seen(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: 
             _add(out, part, naming, baseline, axis)
         numbers = next((one for one in fitted if one.claim is claim and axis in one.axes), None)
         effect = None if numbers is None else numbers.effect
-        if numbers is not None and effect is not None and any(part.candidate.view in _SAID for part in parts):
+        views = {part.candidate.view for part in parts}
+        if numbers is not None and effect is not None and views & _SAID and "power" not in views:  # that part has it, with a free size
             out.known += _said(effect, reduced, axis)
             out.doubt = max([out.doubt, *(2.0 * one.stderr / abs(one.value) for one in numbers.parameters.values() if one.value)])
         if effect is not None and any(is_filter(part.candidate.view, part.variant) for part in parts):
