@@ -15,14 +15,14 @@ import xarray as xr
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gyrostab.diagnose.baseline import calibrate
-from gyrostab.diagnose.candidates import effect_candidates
-from gyrostab.diagnose.cells import begin_state
-from gyrostab.diagnose.claims import Claim, Naming
-from gyrostab.diagnose.ensemble import null_records
-from gyrostab.diagnose.explained import Part, explain_away
-from gyrostab.diagnose.folds import fold_blocks
-from gyrostab.diagnose.refit import fit_claims
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.explained import Part, explain_away
+from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.modelling.refit import fit_claims
+from gyrostab.diagnose.naming.claims import Claim, Naming
 from tests.named import COEFFICIENT, record
 
 

@@ -13,14 +13,14 @@ import xarray as xr
 
 from gyrostab.concealed import plan_case
 from gyrostab.concealed.case import make_case
-from gyrostab.diagnose.baseline import calibrate
-from gyrostab.diagnose.candidates import effect_candidates
-from gyrostab.diagnose.cells import begin_state
-from gyrostab.diagnose.folds import fold_blocks
-from gyrostab.diagnose.gain import mean_factors
-from gyrostab.diagnose.products import mean_products
-from gyrostab.diagnose.reduced import reduce_log
-from gyrostab.diagnose.search import gains, totals
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.search import gains, totals
+from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.gains.gain import mean_factors
+from gyrostab.diagnose.gains.products import mean_products
+from gyrostab.diagnose.reduction.reduced import reduce_log
 
 EFFECTS = ("temperature_bias", "shupe", "warm_up", "vibration_rectification", "bias_jump")
 COLUMNS = ("all known", "size unknown", "K and B unknown too", "scored")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.null_scores import NullScores, standardise
+from gyrostab.diagnose.locating.null_scores import NullScores, standardise
 from gyrostab.diagnose.views import VIEWS
 from gyrostab.noise import TERMS
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline import calibrate, from_model, from_simulation
-from gyrostab.diagnose.ensemble import null_records
-from gyrostab.diagnose.expected import common_variance, noise_powers, white_variance
-from gyrostab.diagnose.quiet import quiet_blocks
-from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
+from gyrostab.diagnose.calibration.expected import common_variance, noise_powers, white_variance
+from gyrostab.diagnose.calibration.quiet import quiet_blocks
+from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.expected import expected_powers
 from gyrostab.kernels.periodogram import band_edges, ordinates, taper

@@ -11,12 +11,12 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.account import _can_show, spans
-from gyrostab.diagnose.candidates import Candidate, Variant
-from gyrostab.diagnose.content import chance_of_gain
+from gyrostab.diagnose.conclusion.account import _can_show, spans
+from gyrostab.diagnose.conclusion.content import chance_of_gain
+from gyrostab.diagnose.conclusion.result import check_diagnosis
 from gyrostab.diagnose.core import diagnose, quiet_span
-from gyrostab.diagnose.explained import Part
-from gyrostab.diagnose.result import check_diagnosis
+from gyrostab.diagnose.effects.candidates import Candidate, Variant
+from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnosis.files import FILES
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.export import to_netcdf

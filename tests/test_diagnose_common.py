@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.account import explanations
-from gyrostab.diagnose.boxes import merged
-from gyrostab.diagnose.candidates import Candidate, Variant
-from gyrostab.diagnose.explained import Part
-from gyrostab.diagnose.locate import locate
-from gyrostab.diagnose.null_scores import null_scores, standardise
-from gyrostab.diagnose.sentences import mismatch_statement
+from gyrostab.diagnose.conclusion.account import explanations
+from gyrostab.diagnose.conclusion.sentences import mismatch_statement
+from gyrostab.diagnose.effects.candidates import Candidate, Variant
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.locating.boxes import merged
+from gyrostab.diagnose.locating.locate import locate
+from gyrostab.diagnose.locating.null_scores import null_scores, standardise
 from gyrostab.diagnose.views import common, mean
 from tests.reduced_records import BLOCK_S, baseline, chunks, records
 

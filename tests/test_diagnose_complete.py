@@ -9,15 +9,15 @@ import pytest
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from gyrostab.diagnose.baseline import calibrate
-from gyrostab.diagnose.cells import State, begin_state
-from gyrostab.diagnose.complete import unrest
-from gyrostab.diagnose.explained import reweighted
-from gyrostab.diagnose.folds import fold_blocks
-from gyrostab.diagnose.generics import generic_candidates
-from gyrostab.diagnose.name import _Search, name_effects
-from gyrostab.diagnose.reduced import reduce_log
-from gyrostab.diagnose.search import Found, Tallies, gains
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.cells import State, begin_state
+from gyrostab.diagnose.effects.explained import reweighted
+from gyrostab.diagnose.effects.generics import generic_candidates
+from gyrostab.diagnose.effects.search import Found, Tallies, gains
+from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.naming.complete import unrest
+from gyrostab.diagnose.naming.name import _Search, name_effects
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.log import make_log
 from tests.named import nulls
 

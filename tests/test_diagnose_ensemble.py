@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline import calibrate, from_model
-from gyrostab.diagnose.ensemble import null_records
-from gyrostab.diagnose.gain import mean_gains, power_gains
-from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.calibration.baseline import calibrate, from_model
+from gyrostab.diagnose.gains.gain import mean_gains, power_gains
+from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.simulate import simulate
 
 NOISE = {"Q": 0.05, "N": 0.003, "B": 0.004, "K": 0.02}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.gain import mean_factors, mean_gains, noise_columns, power_factors, power_gains, score
-from gyrostab.diagnose.products import WIDTHS
+from gyrostab.diagnose.gains.folds import FOLDS, fold_blocks, fold_subsets
+from gyrostab.diagnose.gains.gain import mean_factors, mean_gains, noise_columns, power_factors, power_gains, score
+from gyrostab.diagnose.gains.products import WIDTHS
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.state_space import flicker_states
 from gyrostab.noise import HOUR

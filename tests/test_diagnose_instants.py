@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.baseline import calibrate
-from gyrostab.diagnose.candidates import effect_candidates
-from gyrostab.diagnose.cells import begin_state
-from gyrostab.diagnose.folds import fold_blocks
-from gyrostab.diagnose.search import gains
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.search import gains
+from gyrostab.diagnose.gains.folds import fold_blocks
 from tests.named import COEFFICIENT, record
 
 _BACK = 1913.0  # s, between two values of the thinned grid

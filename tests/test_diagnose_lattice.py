@@ -7,10 +7,10 @@ import pytest
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from gyrostab.diagnose.baseline import calibrate, from_model
-from gyrostab.diagnose.lattice import angle_share, rounded_rates
-from gyrostab.diagnose.name import name_effects
-from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.calibration.baseline import calibrate, from_model
+from gyrostab.diagnose.calibration.lattice import angle_share, rounded_rates
+from gyrostab.diagnose.naming.name import name_effects
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.log import make_log
 from tests.named import nulls
 

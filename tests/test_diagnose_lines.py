@@ -9,14 +9,14 @@ import pytest
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from gyrostab.diagnose.claims import Claim, form_error, with_claim
-from gyrostab.diagnose.designs import Candidate, Variant
-from gyrostab.diagnose.explained import Part
-from gyrostab.diagnose.lines import line_gains, line_skirt
-from gyrostab.diagnose.name import name_effects
-from gyrostab.diagnose.odd import line_size
-from gyrostab.diagnose.parts import without_lines
-from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.effects.designs import Candidate, Variant
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.gains.lines import line_gains, line_skirt
+from gyrostab.diagnose.naming.claims import Claim, form_error, with_claim
+from gyrostab.diagnose.naming.name import name_effects
+from gyrostab.diagnose.naming.odd import line_size
+from gyrostab.diagnose.naming.parts import without_lines
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.log import make_log
 from tests.named import nulls
 

@@ -7,10 +7,10 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from gyrostab.diagnose.boxes import merged
-from gyrostab.diagnose.locate import locate
-from gyrostab.diagnose.null_scores import null_scores
-from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.locating.boxes import merged
+from gyrostab.diagnose.locating.locate import locate
+from gyrostab.diagnose.locating.null_scores import null_scores
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError
 from gyrostab.log import make_log
 from tests.reduced_records import BLOCK_S, RATE, baseline, chunks, records, smallest_p

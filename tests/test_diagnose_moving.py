@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline import calibrate
-from gyrostab.diagnose.candidates import windows_of
-from gyrostab.diagnose.content import motion_tables
-from gyrostab.diagnose.moving import moving_blocks, unexplained_motion, without_motion
-from gyrostab.diagnose.reduced import measured, reduce_log
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.conclusion.content import motion_tables
+from gyrostab.diagnose.effects.candidates import windows_of
+from gyrostab.diagnose.naming.moving import moving_blocks, unexplained_motion, without_motion
+from gyrostab.diagnose.reduction.reduced import measured, reduce_log
 from gyrostab.simulate import simulate
 
 N = 0.01

@@ -10,14 +10,14 @@ import pytest
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from gyrostab.diagnose.explained import Part, explain_away
-from gyrostab.diagnose.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.lines import line_gains
-from gyrostab.diagnose.name import Claim, name_effects, tail_level
-from gyrostab.diagnose.search import together
-from gyrostab.diagnose.structure import possible
-from gyrostab.diagnose.surrogates import beats_slides
-from gyrostab.diagnose.tallies import count_gains, expected_counts
+from gyrostab.diagnose.effects.explained import Part, explain_away
+from gyrostab.diagnose.effects.search import together
+from gyrostab.diagnose.gains.folds import FOLDS, fold_blocks, fold_subsets
+from gyrostab.diagnose.gains.lines import line_gains
+from gyrostab.diagnose.gains.tallies import count_gains, expected_counts
+from gyrostab.diagnose.naming.name import Claim, name_effects, tail_level
+from gyrostab.diagnose.naming.structure import possible
+from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.errors import OptionError
 from tests.named import WORLD, nulls, record
 
@@ -68,7 +68,7 @@ def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
     (part,) = (one for one in claim.parts if one.candidate.view == "power")
     elsewhere = [replace(part, row=(axis,)) for axis in "yz"]
     sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
-    monkeypatch.setattr(sys.modules["gyrostab.diagnose.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
+    monkeypatch.setattr(sys.modules["gyrostab.diagnose.effects.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
     assert possible([part, *elsewhere], state) == [part, elsewhere[1]]
 
 

@@ -11,11 +11,11 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.claims import Claim, Naming
-from gyrostab.diagnose.content import claim_tables
-from gyrostab.diagnose.designs import Candidate, Variant
-from gyrostab.diagnose.explained import Part, without_turns
-from gyrostab.diagnose.reduced import reduce_log
+from gyrostab.diagnose.conclusion.content import claim_tables
+from gyrostab.diagnose.effects.designs import Candidate, Variant
+from gyrostab.diagnose.effects.explained import Part, without_turns
+from gyrostab.diagnose.naming.claims import Claim, Naming
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views import cross_axis, distribution, spectrum
 from gyrostab.log import make_log
 

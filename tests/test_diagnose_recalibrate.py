@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline import calibrate
-from gyrostab.diagnose.candidates import effect_candidates
-from gyrostab.diagnose.cells import begin_state
-from gyrostab.diagnose.claims import Claim, Naming
-from gyrostab.diagnose.explained import Part, explain_away
-from gyrostab.diagnose.folds import fold_blocks
-from gyrostab.diagnose.recalibrate import recalibrate, with_noise
-from gyrostab.diagnose.reduced import reduce_log
-from gyrostab.diagnose.refit import fit_claims, predicted
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.explained import Part, explain_away
+from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.modelling.refit import fit_claims, predicted
+from gyrostab.diagnose.naming.claims import Claim, Naming
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.outliers import lattice_step
-from gyrostab.diagnose.reduced import block_samples, reduce_log
+from gyrostab.diagnose.reduction.outliers import lattice_step
+from gyrostab.diagnose.reduction.reduced import block_samples, reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.periodogram import band_edges, ordinates, taper
 from gyrostab.log import make_log

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline import calibrate
-from gyrostab.diagnose.candidates import effect_candidates
-from gyrostab.diagnose.cells import begin_state
-from gyrostab.diagnose.ensemble import null_records
-from gyrostab.diagnose.explained import Part, explain_away
-from gyrostab.diagnose.folds import fold_blocks
-from gyrostab.diagnose.name import Claim, Naming, name_effects
-from gyrostab.diagnose.odd import line_size
-from gyrostab.diagnose.refit import FORM_ERROR, fit_claims, limits, predicted
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.explained import Part, explain_away
+from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.modelling.refit import FORM_ERROR, fit_claims, limits, predicted
+from gyrostab.diagnose.naming.name import Claim, Naming, name_effects
+from gyrostab.diagnose.naming.odd import line_size
 from gyrostab.simulate import simulate
 from tests.named import COEFFICIENT, nulls, record
 

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.result import VERDICTS, Diagnosis, check_diagnosis, effect_table, model_text, plain
-from gyrostab.diagnose.sentences import chance, clock, mismatch_statement, next_measurement, plain_name, summary
+from gyrostab.diagnose.conclusion.result import VERDICTS, Diagnosis, check_diagnosis, effect_table, model_text, plain
+from gyrostab.diagnose.conclusion.sentences import chance, clock, mismatch_statement, next_measurement, plain_name, summary
 from gyrostab.diagnosis import open_diagnosis, write_diagnosis, write_diagnosis_report
 from gyrostab.diagnosis.files import FILES
 from gyrostab.errors import FormatError, OutputError, SchemaError

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.null_scores import null_scores, standardise
+from gyrostab.diagnose.locating.null_scores import null_scores, standardise
 from gyrostab.diagnose.views import VIEWS, cross_axis, davar, distribution, locked, mean, restart, spectrum
 from gyrostab.diagnose.views.cells import cube_root_score, exponential_score, over_windows, window_set
 from gyrostab.kernels.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
@@ -196,7 +196,7 @@ def test_mean_estimates_the_step(base):
 
 
 def test_a_line_has_its_amplitude():
-    from gyrostab.diagnose.reduced import reduce_log
+    from gyrostab.diagnose.reduction.reduced import reduce_log
     from gyrostab.log import make_log
 
     rng, n = np.random.default_rng(6), 180_000

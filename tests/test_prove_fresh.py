@@ -15,7 +15,7 @@ import pytest
 
 import gyrostab
 from gyrostab.concealed import plan_case, score_table
-from gyrostab.diagnose.result import check_diagnosis
+from gyrostab.diagnose.conclusion.result import check_diagnosis
 from gyrostab.prove.folder import TUNING
 
 NUMBER = 5

@@ -12,9 +12,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.account import explanations
-from gyrostab.diagnose.baseline import calibrate, from_model, from_simulation
-from gyrostab.diagnose.content import (
+from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
+from gyrostab.diagnose.conclusion.account import explanations
+from gyrostab.diagnose.conclusion.content import (
     baseline_table,
     claim_tables,
     effect_tables,
@@ -27,17 +27,17 @@ from gyrostab.diagnose.content import (
     unknown_tables,
     verdict,
 )
-from gyrostab.diagnose.ensemble import null_records
-from gyrostab.diagnose.evidence import held_out
-from gyrostab.diagnose.locate import locate
-from gyrostab.diagnose.moving import unexplained_motion, without_motion
-from gyrostab.diagnose.name import Naming, name_effects
-from gyrostab.diagnose.null_scores import NullScores, null_scores
-from gyrostab.diagnose.recalibrate import recalibrate, with_noise
-from gyrostab.diagnose.reduced import reduce_log
-from gyrostab.diagnose.refit import fit_claims, limits, predicted
-from gyrostab.diagnose.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
-from gyrostab.diagnose.surfaces import make_surfaces
+from gyrostab.diagnose.conclusion.evidence import held_out
+from gyrostab.diagnose.conclusion.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
+from gyrostab.diagnose.conclusion.surfaces import make_surfaces
+from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.locating.locate import locate
+from gyrostab.diagnose.locating.null_scores import NullScores, null_scores
+from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.modelling.refit import fit_claims, limits, predicted
+from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
+from gyrostab.diagnose.naming.name import Naming, name_effects
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import check_log
@@ -86,7 +86,7 @@ def diagnose(
     false_alarm_level : float
         Share of records of the simulation itself in which anything may be found.
     block, restart_gap : str or float
-        As for `gyrostab.diagnose.reduced.reduce_log`.
+        As for `gyrostab.diagnose.reduction.reduced.reduce_log`.
     progress : Stage
         Is told of the progress.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from gyrostab.diagnose.result import Diagnosis, check_diagnosis, model_text
+from gyrostab.diagnose.conclusion.result import Diagnosis, check_diagnosis, model_text
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.export import open_dataset, to_netcdf
 from gyrostab.output import new_output

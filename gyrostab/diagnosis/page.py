@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from gyrostab.diagnose.result import Diagnosis, check_diagnosis
-from gyrostab.diagnose.sentences import axes_text, length_text, next_measurement, plain_name, summary
+from gyrostab.diagnose.conclusion.result import Diagnosis, check_diagnosis
+from gyrostab.diagnose.conclusion.sentences import axes_text, length_text, next_measurement, plain_name, summary
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
 from gyrostab.plot.style import embedded

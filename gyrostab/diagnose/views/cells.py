@@ -126,7 +126,7 @@ def view_dataset(
     name : str
         View, one of the contract's.
     reduced : xarray.Dataset
-        Of `gyrostab.diagnose.reduced.reduce_log`; gives the edges of the windows.
+        Of `gyrostab.diagnose.reduction.reduced.reduce_log`; gives the edges of the windows.
     windows : Windows
         The windows.
     columns : dict

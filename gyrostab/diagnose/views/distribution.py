@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.tallies import OF_LATTICE, coarse_lattice
+from gyrostab.diagnose.gains.tallies import OF_LATTICE, coarse_lattice
 from gyrostab.diagnose.views.cells import Array, over_windows, values_of, view_dataset, window_set
 
 __all__ = ["COUNTS", "LENGTHS", "score"]

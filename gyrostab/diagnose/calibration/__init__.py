@@ -1,0 +1,1 @@
+"""The stationary noise that a record is compared with."""

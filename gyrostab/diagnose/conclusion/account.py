@@ -1,0 +1,179 @@
+"""Which named effect accounts for which mismatch: the same view with the effects in the model, where they are in the same place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.effects.explained import Part, without_turns
+from gyrostab.diagnose.locating.null_scores import NullScores, standardise
+from gyrostab.diagnose.naming.name import Claim
+from gyrostab.diagnose.views import VIEWS
+
+__all__ = ["acting", "explanations", "spans"]
+
+Array = NDArray[np.float64]
+#: Where an effect shows -> views of mismatches that it can explain; "model" ones are looked at again with the effect in the model.
+_SHOWS: dict[str, tuple[str, ...]] = {
+    "mean": ("mean", "restart", "davar", "distribution", "cross_axis"),
+    "power": ("davar", "spectrum", "distribution"),
+    "cross": ("cross_axis", "davar"),
+    "marks": ("distribution", "davar", "spectrum"),
+    "line": ("spectrum", "davar", "distribution"),
+    "order": ("spectrum", "davar", "mean", "distribution", "cross_axis"),
+    "phase_locked": ("spectrum", "davar", "distribution", "mean"),
+    "transfer": ("davar", "cross_axis", "spectrum", "mean", "distribution"),
+    "wander": ("mean", "davar", "restart", "cross_axis"),
+}
+_MODELLED = ("mean", "power", "cross", "wander")  # parts that the baseline with the effects holds
+_LEFT = 0.3  # of a mismatch, that an error of the form may leave
+_ACTS = 0.2  # of its largest, that a contribution counts as there
+_MEETS = 0.3  # of the shorter of effect and mismatch
+_MOST_SPANS = 6
+_BESIDE, _SHARP = 3, 0.02  # lines beside a strong one, and share of its frequency, that belong to it
+_BUMP, _WIDE = 0.371, 4.0
+
+
+def acting(claim: Claim, blocks: int) -> NDArray[np.bool_]:
+    """Blocks in which an effect does something, from its designs; all where these do not depend on time."""
+    there = np.zeros(blocks, bool)
+    for part in claim.parts:
+        design = part.variant.design
+        if part.candidate.view not in ("mean", "power", "cross", "wander") or design.size == 0:
+            return np.ones(blocks, bool)
+        place = [number for number, size in enumerate(design.shape) if size == blocks]
+        if not place:
+            return np.ones(blocks, bool)
+        size = np.abs(np.moveaxis(np.asarray(design), place[0], 0).reshape(blocks, -1))
+        size = np.abs(size - np.median(size, axis=0)) if part.candidate.view == "mean" else size
+        largest = np.nanmax(size, axis=0, initial=0.0)
+        there |= (size > _ACTS * np.where(largest > 0, largest, np.inf)).any(axis=1)
+    return there if there.any() else np.ones(blocks, bool)
+
+
+def spans(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[float, float]]:
+    """Stretches of time [s] in which it is true, short pauses bridged; the whole record where it comes and goes all the time.
+
+    Examples
+    --------
+    >>> t = np.arange(10.0)
+    >>> spans(np.array([0, 0, 1, 1, 1, 0, 0, 0, 0, 0], bool), t, t + 1)
+    [(2.0, 5.0)]
+    """
+    if there.mean() > 0.9:
+        return [(float(begin[0]), float(end[-1]))]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).reshape(-1, 2)
+    joined: list[list[int]] = []
+    for first, stop in edges.tolist():
+        if joined and first - joined[-1][1] <= max(1, there.size // 50):
+            joined[-1][1] = stop
+        else:
+            joined.append([first, stop])
+    if len(joined) > _MOST_SPANS:
+        return [(float(begin[0]), float(end[-1]))]
+    return [(float(begin[first]), float(end[stop - 1])) for first, stop in joined]
+
+
+def explanations(
+    found: xr.Dataset, claims: Sequence[Claim], reduced: xr.Dataset, after: xr.Dataset, null: NullScores, *, level: float
+) -> list[list[str]]:
+    """Effects that explain each mismatch.
+
+    An effect explains it when it acts on one of its axes at its time and can show in its view; and where the baseline with the effects
+    holds what it does there, when the mismatch is gone with that baseline, or nearly so.
+
+    Parameters
+    ----------
+    found : xarray.Dataset
+        From `gyrostab.diagnose.locating.locate.locate`.
+    claims : sequence of Claim
+    reduced, after : xarray.Dataset
+        The recording, and the baseline with the effects.
+    null : NullScores
+        What was found is measured by.
+    level : float
+        False-alarm level.
+
+    Returns
+    -------
+    list of list of str
+        Names, for each mismatch.
+    """
+    scores = _scores(reduced, after, null)
+    begin, end = reduced["begin"].values, reduced["end"].values
+    when = [spans(acting(claim, begin.size), begin, end) for claim in claims]
+    out = []
+    for number in range(found.sizes["mismatch"]):
+        box = {str(name): found[name].values[number] for name in found.data_vars}
+        gone = _gone(box, scores, null, level)
+        names = []
+        for claim, its_time in zip(claims, when, strict=True):
+            views = {part.candidate.view for part in claim.parts if _can_show(part, box, reduced)}
+            near = any(_meet(box, span) for span in its_time) and set(str(box["axes"]).split()) & set(claim.axes)
+            if views and near and (gone or not views <= _modelled(claim, box)):
+                names.append(claim.effect)
+        out.append(list(dict.fromkeys(names)))
+    return out
+
+
+def _modelled(claim: Claim, box: Mapping[str, Any]) -> set[str]:
+    """Parts that must take the mismatch away; that several axes wander as one is in no model, and what wanders on them may do it."""
+    wanders = str(box["what"]) == "slow" and len(set(str(box["axes"]).split()) & set(claim.axes)) > 1
+    return set(_MODELLED) - ({"wander"} if wanders else set())
+
+
+def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
+    """Whether a part of an effect can be seen where a mismatch is.
+
+    A line explains a line at its own frequency only, and a mean of what axes share only what is slow.
+    """
+    if str(box["view"]) not in _SHOWS.get(part.candidate.view, ()):
+        return False
+    if part.candidate.view in ("mean", "wander") and box["view"] == "cross_axis" and box["what"] != "slow":
+        return False
+    if part.candidate.view != "line" or part.place < 0 or box["view"] == "distribution":
+        return True
+    lines = reduced["line_frequency"].values
+    mine = float(lines[part.place])
+    if np.isfinite(box["frequency"]):
+        return bool(abs(box["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine)
+    tau = _BUMP / mine  # where the Allan variance of a sine is largest
+    return str(box["what"]) in ("avar", "level") and bool(box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE)
+
+
+def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
+    shared = min(box["end"], span[1]) - max(box["begin"], span[0])
+    return bool(shared >= _MEETS * min(box["end"] - box["begin"], span[1] - span[0]))
+
+
+def _scores(reduced: xr.Dataset, after: xr.Dataset, null: NullScores) -> list[tuple[str, xr.Dataset, Array]]:
+    """Views of the recording against the baseline with the effects."""
+    out = []
+    turns_left_out = without_turns(reduced, after["spectrum"].transpose("axis", "block", "band").values)
+    for name, score in VIEWS.items():
+        seen = turns_left_out if name == "distribution" else reduced
+        scores = score(seen, after) if name in null.views else None
+        if scores is not None:
+            out.append((name, scores, standardise(scores, null.views[name])))
+    return out
+
+
+def _gone(box: Mapping[str, Any], scores: Sequence[tuple[str, xr.Dataset, Array]], null: NullScores, level: float) -> bool:
+    """Whether, where the mismatch was, nothing is left that would be one, or little of it."""
+    left, limit = 0.0, np.inf
+    for name, view, z in scores:
+        if view.attrs["view"] != box["view"] or str(box["what"]) not in view["what"].values:
+            continue
+        rows = [number for number, axes in enumerate(view["axes"].values) if set(str(axes).split()) & set(str(box["axes"]).split())]
+        inside = (view["begin"].values >= box["begin"] - 1e-6) & (view["end"].values <= box["end"] + 1e-6)
+        columns = (view["what"].values == box["what"]) & (view["tau_min_s"].values >= 0.99 * box["tau_min_s"])
+        columns &= view["tau_min_s"].values <= 1.01 * box["tau_max_s"]
+        cells = np.abs(z[np.ix_(rows, inside, columns)])
+        if np.isfinite(cells).any():
+            left = max(left, float(np.nanmax(cells)))
+            limit = min(limit, max(null.critical(name, level), _LEFT * abs(float(box["z"]))))
+    return left < limit

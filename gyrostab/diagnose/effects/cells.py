@@ -1,0 +1,283 @@
+"""Views whose noise is independent from cell to cell: powers, cross-spectra, orders, profiles, transfers, as linear models.
+
+The data may be a recording or null records, with the dimension ``record`` in front. Weights and given columns are those of a `State`: what
+is believed of the noise, and what is named so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.effects.candidates import Candidate
+from gyrostab.diagnose.gains.gain import Cells, independent, noise_columns
+from gyrostab.diagnose.reduction.reduced import measured
+
+__all__ = ["State", "begin_state", "cells_of", "drawn", "effective", "pair_rows", "view_rows"]
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class State:
+    """What is believed of a record when a candidate is tried.
+
+    Attributes
+    ----------
+    reduced : xarray.Dataset
+        The recording: shapes, samples, channels.
+    baseline : xarray.Dataset
+        From `gyrostab.diagnose.calibration.baseline`.
+    weight : ndarray, shape (axis, block, band)
+        Powers that the weights of all cells are taken from [degree2 hour-2 Hz-1]: the expected ones and those of the effects so far.
+    masked : ndarray of bool, shape (axis, block)
+        Blocks of which powers and cross-spectra are left out.
+    given : mapping of (str, str) to list of ndarray
+        (view, row) -> columns that are in the model with and without a candidate; the row is an axis, or both axes of a pair with a
+        comma between.
+    """
+
+    reduced: xr.Dataset
+    baseline: xr.Dataset
+    weight: Array
+    masked: NDArray[np.bool_]
+    given: dict[tuple[str, str], list[Array]] = field(default_factory=dict)
+
+    def with_columns(self, view: str, row: str, columns: Sequence[Array]) -> State:
+        """The same with more given columns."""
+        given = dict(self.given)
+        given[view, row] = [*given.get((view, row), []), *columns]
+        return replace(self, given=given)
+
+    @property
+    def axes(self) -> list[str]:
+        """Names of the axes."""
+        return [str(one) for one in self.reduced["axis"].values]
+
+
+def begin_state(reduced: xr.Dataset, baseline: xr.Dataset) -> State:
+    """Nothing is named yet."""
+    weight = baseline["spectrum"].transpose("axis", "block", "band").values
+    return State(reduced, baseline, weight, np.zeros(weight.shape[:2], np.bool_))
+
+
+def drawn(cells: Cells, rng: np.random.Generator, count: int) -> Cells:
+    """The same cells with noise alone, `count` records of it."""
+    spread = np.where(cells.weight > 0.0, 1.0 / np.sqrt(np.where(cells.weight > 0.0, cells.weight, 1.0)), 0.0)
+    return cells._replace(values=spread[..., None] * rng.standard_normal((*spread.shape, count)))
+
+
+def effective(density: Array, reduced: xr.Dataset) -> Array:
+    """A density, (axis or 1, block or 1, band), as gaps let it be seen: mixed with its mean over frequency, (axis, block, band)."""
+    near = reduced["neighbours"].values[..., None]
+    width = reduced["band_high"].values - reduced["band_low"].values
+    level = (density * width).sum(axis=-1, keepdims=True) / width.sum()
+    return np.asarray(np.where(np.isfinite(near), near * density + (1.0 - near) * level, density))
+
+
+def pair_rows(reduced: xr.Dataset) -> list[tuple[str, ...]]:
+    """Both axes of each pair."""
+    return [(str(a), str(b)) for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)]
+
+
+def view_rows(candidate: Candidate, state: State) -> list[tuple[str, ...]]:
+    """Axes that each row of a view speaks about."""
+    if candidate.view == "cross":
+        return pair_rows(state.reduced)
+    if candidate.view == "order" and not candidate.each:
+        pattern = np.abs(candidate.variants[0].design[0]).max(axis=-1)
+        return [tuple(axis for axis, size in zip(state.axes, pattern, strict=True) if size > 0)]
+    return [(axis,) for axis in state.axes]
+
+
+def cells_of(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+    """One row of a view for candidates of that view that have the same rows; the designs are those of all their variants in order.
+
+    Candidates of the view "transfer" must have the same witness.
+    """
+    return _BUILDERS[candidates[0].view](candidates, row, data, state)
+
+
+# ---------------------------------------------------------------------------------------------------------------- frames
+
+
+def _records(values: Array, plain: int) -> Array:
+    """Data with the record last."""
+    return np.moveaxis(values, 0, -1) if values.ndim > plain else values[..., None]
+
+
+def _parts(values: Array, axis: int = -1) -> Array:
+    """Real and imaginary parts side by side."""
+    return np.concatenate([values.real, values.imag], axis=axis)
+
+
+def _beside(state: State, view: str, row: tuple[str, ...], shape: tuple[int, ...], known: Sequence[Array] = (), precision: Any = ()) -> Any:
+    """Given columns (block, cell, column) and their precision: those known beforehand, and those of the effects named."""
+    named = state.given.get((view, ",".join(row)), [])
+    columns = [np.broadcast_to(one, shape) for one in [*known, *named]]
+    given = np.stack(columns, axis=-1) if columns else np.empty((*shape, 0))
+    return given, np.diag([*precision, *[-1.0] * len(named)])
+
+
+def _spread(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
+    """Columns (block, cell, column)."""
+    return np.stack([np.broadcast_to(one, shape) for one in columns], axis=-1)
+
+
+def _row(design: Array, row: int) -> Array:
+    """The row of a column (axis or 1, ...)."""
+    return np.asarray(design[row] if design.shape[0] > 1 else design[0])
+
+
+# --------------------------------------------------------------------------------------------------------------- powers
+
+
+def power_column(density: Array, row: int, state: State) -> Array:
+    """An added density (axis or 1, block or 1, band) on one axis as gaps let it be seen, (block, band)."""
+    return np.asarray(np.broadcast_to(effective(density, state.reduced), state.weight.shape)[row])
+
+
+def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+    axis = state.axes[row]
+    expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
+    values = _records(data["power"].transpose(..., "axis", "block", "band").values, 3)[row] - expected[..., None]
+    weight = state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values / state.weight[row] ** 2
+    weight = np.where(state.masked[row][:, None], 0.0, weight)
+    level, precision = noise_columns(state.baseline, axis=axis)
+    known = [level[..., number] * expected for number in range(level.shape[2])]
+    given, whole = _beside(state, "power", (axis,), weight.shape, known, np.diagonal(precision))
+    designs = [
+        _spread([power_column(one, row, state) for one in variant.design], weight.shape) for each in candidates for variant in each.variants
+    ]
+    return independent(Cells(values, weight, designs, given, whole), state.baseline["common"].sel(axis=axis).values, state.weight[row])
+
+
+# --------------------------------------------------------------------------------------------------------------- crosses
+
+
+def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+    pair = pair_rows(state.reduced)[row]
+    i, j = (state.axes.index(axis) for axis in pair)
+    values = _records(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row]
+    shape = np.sqrt(state.reduced["shape"].values[i] * state.reduced["shape"].values[j])
+    weight = 2.0 * shape / (state.weight[i] * state.weight[j])
+    weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
+    weight = np.concatenate([weight, weight], axis=1)
+    given, precision = _beside(state, "cross", pair, weight.shape)
+    designs = [
+        _spread([_parts(_row(one, row) + 0j) for one in variant.design], weight.shape) for each in candidates for variant in each.variants
+    ]
+    return Cells(_parts(values, axis=1), weight, designs, given, precision)
+
+
+# ---------------------------------------------------------------------------------------------------------------- orders
+
+
+def order_weight(state: State) -> Array:
+    """(axis, block, harmonic): one over the variance of each part of a complex amplitude."""
+    reduced = state.reduced
+    rate, frequency = float(reduced.attrs["sampling_rate_hz"]), reduced["frequency"].values
+    place = np.abs(reduced["channel_rotation_rate"].values)[:, None] / 360.0 * reduced["harmonic"].values
+    good = np.isfinite(reduced["order"].values) & (place * float(reduced.attrs["block_s"]) >= 2.0) & (place < rate / 2.0)
+    nearest = np.abs(np.log(np.maximum(place, frequency[0])[..., None] / frequency)).argmin(axis=-1)
+    level = np.take_along_axis(state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2)
+    seconds = reduced["samples"].values[..., None] / rate
+    return np.where(good, seconds / (2.0 * level), 0.0)
+
+
+def harmonic_sets(count: int) -> list[tuple[int, ...]]:
+    """Each harmonic by itself, and all together."""
+    return [*((k,) for k in range(count)), *([tuple(range(count))] if count > 1 else [])]
+
+
+def order_columns(pattern: Array, chosen: tuple[int, ...]) -> list[Array]:
+    """Columns (cell,) of a complex factor for each harmonic chosen, the cells real parts then imaginary parts of the harmonics."""
+    columns = []
+    for k in chosen:
+        one = np.zeros_like(pattern)
+        one[..., k] = pattern[..., k]
+        columns += [_parts(one), _parts(1j * one)]
+    return columns
+
+
+def _order(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+    values = _records(data["order"].transpose(..., "axis", "block", "harmonic").values, 3)
+    weight = order_weight(state)
+    count = weight.shape[-1]
+    if candidates[0].each:
+        both = np.concatenate([weight[row], weight[row]], axis=1)
+        designs = [_spread(order_columns(np.ones(count, complex), chosen), both.shape) for chosen in harmonic_sets(count)]
+        given, precision = _beside(state, "order", (state.axes[row],), both.shape)
+        return Cells(_parts(values[row], axis=1), both, designs * len(candidates), given, precision)
+    both = np.concatenate([np.concatenate([one, one], axis=1) for one in weight], axis=1)  # the cells of all axes side by side
+    stacked = np.concatenate([_parts(one, axis=1) for one in values], axis=1)
+    designs = []
+    for each in candidates:
+        for variant in each.variants:
+            for pattern in (variant.design[0], np.conj(variant.design[0])):
+                by_axis = [order_columns(one, (0,)) for one in pattern]
+                designs.append(_spread([np.concatenate(parts) for parts in zip(*by_axis, strict=True)], both.shape))
+    named = [state.given.get(("order", axis), []) for axis in state.axes]
+    given, precision = np.empty((*both.shape, 0)), np.empty((0, 0))
+    for number, columns in enumerate(named):
+        for one in columns:
+            wide = np.zeros((*both.shape, 1))
+            wide[:, number * 2 * count : (number + 1) * 2 * count, 0] = one
+            given = np.concatenate([given, wide], axis=2)
+    if given.shape[2]:
+        precision = -np.eye(given.shape[2])
+    return Cells(stacked, both, designs, given, precision)
+
+
+# -------------------------------------------------------------------------------------------------------------- profiles
+
+
+def _profile(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+    values = _records(data["profile"].transpose(..., "axis", "block", "phase").values, 3)[row]
+    rate = float(state.reduced.attrs["sampling_rate_hz"])
+    width = (state.reduced["band_high"] - state.reduced["band_low"]).values
+    variance = rate * (state.weight[row] * width).sum(axis=-1) / width.sum()
+    weight = state.reduced["profile_samples"].values[row] / variance[:, None]
+    given, precision = _beside(state, "phase_locked", (state.axes[row],), weight.shape, [np.ones(weight.shape[1])], [-1.0])
+    designs = [_spread(list(variant.design), weight.shape) for each in candidates for variant in each.variants]
+    return Cells(values, weight, designs, given, precision)
+
+
+# ------------------------------------------------------------------------------------------------------------- transfers
+
+
+def witness_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset) -> tuple[Array, Array]:
+    """Cross-power of an axis with a channel or another axis, (block, band, record), and the power of that, (block, band)."""
+    axes = [str(one) for one in reduced["axis"].values]
+    if name in axes:
+        cross = _records(measured(data, "cross").transpose(..., "pair", "block", "band").values, 3)
+        there = np.isfinite(reduced["power"].values[row])[..., None]
+        found = np.full(cross.shape[1:], np.nan + 0j)
+        for number, pair in enumerate(pair_rows(reduced)):
+            if set(pair) == {name, axes[row]} and name != axes[row]:
+                found = np.where(there, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan)
+        return found, measured(reduced, "power").sel(axis=name).transpose("block", "band").values
+    place = [str(one) for one in reduced["witness"].values].index(name)
+    cross = _records(data["witness_cross"].transpose(..., "axis", "witness", "block", "band").values, 4)
+    return cross[row, place], reduced["witness_power"].transpose("witness", "block", "band").values[place]
+
+
+def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+    cross, power = witness_of(candidates[0].witness[0], row, data, state.reduced)
+    root = np.sqrt(np.where(power > 0.0, power, np.nan))
+    weight = 2.0 * state.reduced["shape"].values[row] / state.weight[row]
+    weight = np.where(np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0)
+    weight = np.concatenate([weight, weight], axis=1)
+    with np.errstate(invalid="ignore"):
+        values = _parts(cross / root[..., None], axis=1)
+    given, precision = _beside(state, "transfer", (state.axes[row],), weight.shape)
+    designs = [_spread([_parts(one * root) for one in variant.design], weight.shape) for each in candidates for variant in each.variants]
+    return Cells(values, weight, designs, given, precision)
+
+
+_BUILDERS = {"power": _power, "cross": _cross, "order": _order, "phase_locked": _profile, "transfer": _transfer}

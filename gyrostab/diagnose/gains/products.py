@@ -1,0 +1,235 @@
+"""Products of whitened data and designs, and what they say of a design whose size is unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.gains.folds import FOLDS
+from gyrostab.kernels.evidence import mixed_evidence
+from gyrostab.kernels.state_space import flicker_states, whiten
+from gyrostab.noise import HOUR
+
+__all__ = ["WIDTHS", "Array", "Products", "evidence", "limits_of", "mean_products", "power_products", "score", "share_out", "take_out"]
+
+Array = NDArray[np.float64]
+#: Standard deviations of the prior of a factor, in errors that it would have in white noise.
+WIDTHS = (1.0, 10.0, 100.0, 1000.0)
+#: A design that keeps less than this share of its square beside constants and given columns is not there.
+_NOTHING = 1e-9
+
+
+@dataclass(frozen=True)
+class Products:
+    """Products of whitened data and columns on some of the blocks; one grid point where there is no grid.
+
+    Attributes
+    ----------
+    square : ndarray, shape (grid, record)
+        ``y' y``.
+    cross : ndarray, shape (grid, column, record)
+        ``x' y``.
+    gram : ndarray, shape (grid, column, column)
+        ``x' x``.
+    log_determinant : ndarray, shape (grid,)
+        Of the covariance.
+    """
+
+    square: Array
+    cross: Array
+    gram: Array
+    log_determinant: Array
+
+
+def take_out(products: Products, given: int, precision: Array) -> Products:
+    """Take the last `given` columns out: they are in every model, with normal priors of this precision (given, given)."""
+    if not given:
+        return products
+    keep = slice(None, products.gram.shape[1] - given)
+    out = slice(products.gram.shape[1] - given, None)
+    inner = products.gram[:, out, out] + precision
+    to_x = np.linalg.solve(inner, products.gram[:, out, keep])
+    to_y = np.linalg.solve(inner, products.cross[:, out])
+    return Products(
+        square=products.square - (products.cross[:, out] * to_y).sum(axis=1),
+        cross=products.cross[:, keep] - products.gram[:, keep, out] @ to_y,
+        gram=products.gram[:, keep, keep] - products.gram[:, keep, out] @ to_x,
+        log_determinant=products.log_determinant + np.linalg.slogdet(inner)[1] - np.linalg.slogdet(precision)[1],
+    )
+
+
+def limits_of(before: Array, after: Array) -> Array:
+    """Error of the factor of every column in white noise [1 / unit of the column], 0 where there is nothing to see.
+
+    `before` and `after` are the squares of the columns, and what is left of them beside the constant and the given columns.
+    """
+    seen = after > _NOTHING * np.maximum(before, np.finfo(float).tiny)
+    return np.where(seen, 1.0 / np.sqrt(np.where(seen, after, 1.0)), 0.0)
+
+
+def mean_products(
+    values: Array,
+    columns: Array,
+    *,
+    variance: Array,
+    step: float,
+    K: Array,
+    B: Array,
+    present: NDArray[np.bool_],
+) -> Products:
+    """Products of block means and columns, whitened for every pair of K and B.
+
+    Parameters
+    ----------
+    values : ndarray, shape (block, record)
+        Block means [degree hour-1]; anything where not `present`.
+    columns : ndarray, shape (block, column)
+        Designs.
+    variance : ndarray, shape (block,)
+        White variance of the means [degree2 hour-2].
+    step : float
+        Length of a block [s].
+    K, B : ndarray, shape (grid,)
+        Random walk [deg/h^1.5] and flicker [deg/h].
+    present : ndarray of bool, shape (block,)
+        Blocks that are used.
+    """
+    n, width = columns.shape
+    both = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
+    both[~present] = 0.0
+    spread = np.where(present, variance, 1.0)
+    share, time, white = flicker_states(step, n * step)
+    steps = np.full(n, step)
+    shape = (K.size, values.shape[1])
+    square, cross = np.empty(shape), np.empty((K.size, width, shape[1]))
+    gram, determinant = np.empty((K.size, width, width)), np.empty(K.size)
+    for g, (k, b) in enumerate(zip(K**2 / HOUR, B**2, strict=True)):
+        states = (share * b, time) if b > 0.0 else (share[:0], time[:0])
+        done, determinant[g] = whiten(both, spread + b * white, steps, present, float(k), *states)
+        x, y = done[:, :width], done[:, width:]
+        gram[g], cross[g], square[g] = x.T @ x, x.T @ y, np.einsum("ij,ij->j", y, y)
+    return Products(square, cross, gram, determinant)
+
+
+def power_products(residual: Array, weight: Array, columns: Array) -> Products:
+    """Products of relative band powers and columns, cells weighted by their shape.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (cell, record)
+        ``power / spectrum - 1``.
+    weight : ndarray, shape (cell,)
+        Shape of the gamma distribution of the power; 0 where there is none, where `residual` may be anything finite.
+    columns : ndarray, shape (cell, column)
+        Relative change of the spectrum for a unit of each factor.
+    """
+    weighted = (columns * weight[:, None]).T
+    square = weight @ (residual * residual)
+    return Products(square[None], (weighted @ residual)[None], (weighted @ columns)[None], np.zeros(1))
+
+
+def share_out(values: Array, weight: Array, common: Array, unit: Array | None = None) -> Array:
+    """Take from the cells of each block so much of their common part that they are as good as independent.
+
+    Under random gaps the powers of all bands of a block rise and fall together: their covariance is ``1 / weight`` on the diagonal,
+    and ``common`` times the product of the units everywhere. Products of columns that went through here are those of that covariance.
+
+    Parameters
+    ----------
+    values : ndarray, shape (block, cell, column)
+        Data or designs.
+    weight : ndarray, shape (block, cell)
+        One over the variance that is not common; 0 where there are no data.
+    common : ndarray, shape (block,)
+        Variance of the common part.
+    unit : ndarray, shape (block, cell), optional
+        How strong it is in each cell, 1 by default.
+
+    Examples
+    --------
+    >>> weight, values = np.array([[4.0, 1.0]]), np.array([[[1.0], [3.0]]])
+    >>> free = share_out(values, weight, np.array([0.5]))
+    >>> float((weight[..., None] * free**2).sum().round(9))
+    6.0
+    >>> float((values[0].T @ np.linalg.inv([[0.75, 0.5], [0.5, 1.5]]) @ values[0])[0, 0].round(9))
+    6.0
+    """
+    one = np.ones_like(weight) if unit is None else unit
+    total = (weight * one**2).sum(axis=1)
+    taken = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(total > 0.0, total, 1.0)
+    part = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
+    return np.asarray(values - one[..., None] * part[:, None])
+
+
+def evidence(products: Products, designs: Sequence[NDArray[np.int64]], limits: Array, log_weight: Array) -> Array:
+    """Log marginal likelihood without any design, and with each.
+
+    Parameters
+    ----------
+    products : Products
+    designs : sequence of ndarray
+        Numbers of the columns of each design.
+    limits : ndarray, shape (column,)
+        Error of every factor in white noise; 0 for columns that do nothing.
+    log_weight : ndarray, shape (grid,)
+        Logarithm of the weight of every grid point.
+
+    Returns
+    -------
+    ndarray, shape (1 + design, record)
+    """
+    weight = log_weight - np.logaddexp.reduce(log_weight)
+    base = np.ascontiguousarray((weight[:, None] - 0.5 * (products.square + products.log_determinant[:, None])).T)
+    out = np.empty((1 + len(designs), base.shape[0]))
+    out[0] = np.logaddexp.reduce(base, axis=1)
+    widths = np.square(WIDTHS)
+    for number, chosen in enumerate(designs, start=1):
+        scale = limits[chosen]
+        gram = products.gram[:, chosen[:, None], chosen] * np.outer(scale, scale)
+        cross = products.cross[:, chosen] * scale[:, None]
+        if chosen.size == 1:
+            eigenvalues, rotated = gram[:, :, 0], cross
+        else:
+            eigenvalues, vectors = np.linalg.eigh(gram)
+            rotated = vectors.transpose(0, 2, 1) @ cross
+        out[number] = mixed_evidence(base, np.ascontiguousarray(rotated.transpose(2, 0, 1)), np.maximum(eigenvalues, 0.0), widths)
+    return out
+
+
+def score(factors: Array, owner: Sequence[int] | NDArray[np.int64], *, weight: Sequence[float] | None = None, folds: int = FOLDS) -> Array:
+    """Held-out gain of candidates, the largest over the lengths of the folds.
+
+    Parameters
+    ----------
+    factors : ndarray, shape (subset, design, record)
+        Logarithms of Bayes factors [nats] on the subsets of `fold_subsets`, without the column of the evidence of none. Factors of
+        data that are independent, as means and powers, may be added before.
+    owner : sequence of int, shape (design,)
+        Number of the candidate to which each design belongs.
+    weight : sequence of float, shape (design,), optional
+        Chance of each design before the data are seen, against the others of its candidate; all alike by default.
+
+    Returns
+    -------
+    ndarray, shape (candidate, record)
+        Sum over the folds of log Bayes factor on all less that on all but the fold [nats].
+
+    Examples
+    --------
+    >>> factors = np.zeros((5, 2, 1))
+    >>> factors[0, 1], factors[1:, 1] = 8.0, 6.0
+    >>> [float(score(factors, [0, 0], weight=share)[0, 0].round(2)) for share in ([1.0, 1.0], [1.0, 9.0])]
+    [7.99, 8.0]
+    """
+    owner = np.asarray(owner)
+    chance = np.zeros(owner.size) if weight is None else np.log(np.asarray(weight, dtype=np.float64))
+    out = []
+    for candidate in range(int(owner.max()) + 1 if owner.size else 0):
+        chosen = owner == candidate
+        own = chance[chosen] - np.logaddexp.reduce(chance[chosen])
+        mixed = np.logaddexp.reduce(factors[:, chosen] + own[:, None], axis=1)
+        out.append((mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1).max(axis=0))
+    return np.array(out).reshape(len(out), factors.shape[2])

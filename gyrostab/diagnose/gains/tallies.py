@@ -1,0 +1,136 @@
+"""Counts of odd samples: gains of what is not linear in a few designs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.gains.folds import FOLDS
+
+__all__ = [
+    "COUNTS",
+    "OF_LATTICE",
+    "Expected",
+    "coarse_lattice",
+    "count_gains",
+    "expected_counts",
+    "kurtosis_gains",
+    "still_scatter",
+]
+
+Array = NDArray[Any]
+#: Counts of blocks that effects raise.
+COUNTS = ("outliers", "repeats", "extremes", "zeros")
+#: Statistics of the distribution that a coarse lattice makes by itself.
+OF_LATTICE = ("repeats", "extremes", "zeros", "kurtosis")
+_COARSE, _STILL = 0.2, 0.1  # step in scatters of the samples; share of the blocks that tell the scatter at rest
+_SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
+
+
+def coarse_lattice(reduced: xr.Dataset) -> NDArray[np.bool_]:
+    """Axes whose lattice is so coarse that equal samples, zeros and tails are its own, and tell of nothing else.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        Recording or null records.
+
+    Returns
+    -------
+    ndarray of bool, shape (axis,)
+
+    Examples
+    --------
+    >>> one = {"lattice": ("axis", [3.0, 0.1]), "power": (("axis", "block", "band"), np.full((2, 9, 1), 0.5))}
+    >>> coarse_lattice(xr.Dataset(one, coords={"band_low": ("band", [0.0]), "band_high": ("band", [100.0])}))
+    array([ True, False])
+    """
+    if "lattice" not in reduced:
+        return np.zeros(reduced.sizes["axis"], np.bool_)
+    return np.asarray(reduced["lattice"].values > _COARSE * still_scatter(reduced))
+
+
+def still_scatter(reduced: xr.Dataset) -> NDArray[np.float64]:
+    """Scatter of the samples of every axis in its quiet blocks [degree hour-1]; inf without any."""
+    width = reduced["band_high"].values - reduced["band_low"].values
+    power = reduced["power"].transpose("axis", ..., "band").values
+    square = 2.0 * (power @ width).reshape(len(power), -1)
+    return np.sqrt([np.quantile(row[np.isfinite(row)], _STILL) if np.isfinite(row).any() else np.inf for row in square])
+
+
+class Expected:
+    """Mean and overdispersion of the counts of null records, by axis, gathered chunk by chunk."""
+
+    def __init__(self) -> None:
+        self.sums: dict[str, list[Array]] = {name: [] for name in (*COUNTS, "kurtosis")}
+
+    def add(self, nulls: xr.Dataset) -> None:
+        """Take in some null records."""
+        for name in self.sums:
+            if name in nulls:
+                self.sums[name].append(nulls[name].transpose("record", "axis", "block").values.astype(np.float64))
+
+    def blocks(self, name: str) -> Array:
+        """(record, axis, block)."""
+        return np.concatenate(self.sums[name])
+
+
+def expected_counts(values: Array) -> tuple[Array, Array]:
+    """Mean of a block's count and overdispersion of the record's, both (axis,), from null records (record, axis, block)."""
+    total = values.sum(axis=2)
+    mean = np.maximum(total.mean(axis=0), 1.0 / len(total))
+    spread = np.maximum(total.var(axis=0) / mean, 1.0)
+    return mean / values.shape[2], spread
+
+
+def _log_ratio(count: Array, mean: Array) -> Array:
+    """Log Bayes factor of a count that is raised by an unknown factor, over one that is not."""
+    from scipy.special import gammaln
+
+    a, b = _SHAPE, _RATE
+    raised = gammaln(count + a) - gammaln(a) + a * np.log(b) - (count + a) * np.log(b + mean) + count * np.log(mean)
+    even = -mean + count * np.log(mean)
+    return np.asarray(np.where(count > mean, raised - even, np.minimum(raised - even, 0.0)))
+
+
+def _held_out(evidence: Array, lengths: int) -> Array:
+    """Largest over the lengths of the sum over folds, from (subset, ...)."""
+    parts = evidence[1:].reshape(lengths, FOLDS, *evidence.shape[1:])
+    return np.asarray((evidence[0] - parts).sum(axis=1).max(axis=0))
+
+
+def count_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
+    """Held-out gain of a raised count.
+
+    Parameters
+    ----------
+    values : ndarray, shape (record, axis, block)
+    mean, spread : ndarray, shape (axis,)
+        From `expected_counts`.
+    subsets : ndarray of bool, shape (subset, block)
+        From `fold_subsets`.
+
+    Returns
+    -------
+    ndarray, shape (record, axis)
+    """
+    found = []
+    for subset in subsets:
+        count = values[:, :, subset].sum(axis=2) / spread
+        found.append(_log_ratio(count, mean * subset.sum() / spread))
+    return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
+
+
+def kurtosis_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
+    """Held-out gain of a higher kurtosis; `mean` and `spread` are those of a block, (axis,); the rest as in `count_gains`."""
+    z = np.clip(np.where(np.isfinite(values), (values - mean[:, None]) / spread[:, None], 0.0), -8.0, 8.0)
+    found = []
+    for subset in subsets:
+        total = z[:, :, subset].sum(axis=2) / np.sqrt(subset.sum())
+        size = 100.0  # prior variance, of the total of the whole record
+        part = size * subset.mean()
+        found.append(0.5 * total**2 * part / (1.0 + part) * (total > 0) - 0.5 * np.log1p(part))
+    return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)

@@ -1,0 +1,1 @@
+"""Where recording and simulation differ, against records of noise alone."""

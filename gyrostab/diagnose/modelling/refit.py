@@ -1,0 +1,403 @@
+"""Fit all named effects together: values with honest errors, the model with the effects in it, and limits for what was not found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.effects.candidates import Candidate, Variant
+from gyrostab.diagnose.effects.cells import State, begin_state, pair_rows
+from gyrostab.diagnose.effects.explained import Part, explain_away, mean_columns
+from gyrostab.diagnose.effects.response import is_filter
+from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
+from gyrostab.diagnose.modelling.predict import predicted
+from gyrostab.diagnose.naming.filters import filter_sizes
+from gyrostab.diagnose.naming.name import AMBIGUOUS, Claim, Naming
+from gyrostab.diagnose.naming.odd import line_size, mark_sizes
+from gyrostab.diagnose.naming.plainer import plainer
+from gyrostab.errors import GyrostabError
+from gyrostab.physics.base import Effect
+from gyrostab.physics.registry import effects
+
+__all__ = ["FORM_ERROR", "Estimate", "Fitted", "Limit", "fit_claims", "limits", "predicted"]
+
+Array = NDArray[np.float64]
+#: Error of the form of an effect, as a share of its size: no effect is exactly what its equation says.
+FORM_ERROR = 0.04
+_TWO_SIDED = 1.959964
+_ONE_SIDED = 1.644854
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter.
+
+    Attributes
+    ----------
+    value, stderr : float
+    low, high : float
+        Ends of the 95 % interval.
+    unit : str
+    """
+
+    value: float
+    stderr: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A named effect with its numbers, on one axis or on several at once.
+
+    Attributes
+    ----------
+    claim : Claim
+    axes : tuple of str
+    parameters : mapping of str to Estimate
+        Of an effect with a number for each axis: name and axis, with a dot between, where there are several axes.
+    effect : Effect or None
+        With these numbers, as a model takes it; None where they make no effect.
+    note : str
+        What the numbers do not say.
+    """
+
+    claim: Claim
+    axes: tuple[str, ...]
+    parameters: Mapping[str, Estimate]
+    effect: Effect | None
+    note: str = ""
+
+    def say(self) -> str:
+        """One sentence in plain words."""
+        if self.effect is None or not self.parameters:
+            return f"{effects()[self.claim.effect].short} (on {', '.join(self.axes)})."
+        said = self.effect.say({name: one.stderr for name, one in self.parameters.items()})
+        return f"{said} {self.note}" if self.note else said
+
+
+@dataclass(frozen=True)
+class Limit:
+    """An effect that was not found: how large it may be, at 95 %; NaN where the record cannot tell."""
+
+    upper_limit: float
+    unit: str
+    reason: str
+
+
+def fit_claims(naming: Naming, baseline: xr.Dataset) -> list[Fitted]:
+    """Fit all named effects, each with the others in the model.
+
+    Parameters
+    ----------
+    naming : Naming
+        From `gyrostab.diagnose.naming.name.name_effects`.
+    baseline : xarray.Dataset
+        That the naming started from.
+
+    Returns
+    -------
+    list of Fitted
+        An entry for each axis of an effect with one number for all of its axes; one entry for all axes where each has its own number.
+    """
+    start = begin_state(naming.state.reduced, baseline)
+    found: list[Fitted] = []
+    for claim in naming.claims:
+        state = start
+        rest = [one.parts for one in naming.claims if one is not claim] + [one.parts for one in naming.unknown]
+        for parts in rest:
+            state = explain_away(state, list(parts))
+        state = replace(state, weight=naming.state.weight, masked=naming.state.masked)
+        found += _fit_claim(claim, state, naming)
+    return found
+
+
+def _fit_claim(claim: Claim, state: State, naming: Naming) -> list[Fitted]:
+    views = {part.candidate.view for part in claim.parts}
+    kind = effects()[claim.effect]
+    many = any(item.many for item in kind.parameters() if item.name in kind.size_parameters)
+    filtered = any(is_filter(part.candidate.view, part.variant) for part in claim.parts)  # one logger: its axes are filtered alike
+    together = many or filtered or "cross" in views or any(not part.candidate.each for part in claim.parts)
+    if together:
+        return [_fitted(claim, claim.axes, list(claim.parts), state, naming)]
+    return [_fitted(claim, (axis,), [part for part in claim.parts if axis in part.row], state, naming) for axis in claim.axes]
+
+
+def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State, naming: Naming) -> Fitted:
+    kind = effects()[claim.effect]
+    units = {item.name: item.unit for item in kind.parameters()}
+    values: dict[str, Any] = {}
+    estimates: dict[str, Estimate] = {}
+    by_view: dict[str, list[Part]] = {}
+    for part in parts:
+        by_view.setdefault(part.candidate.view, []).append(part)
+    view = max(by_view, key=lambda name: sum(part.gain for part in by_view[name]))
+    plain = [plainer(part, state) for part in by_view[view]]
+    by_view[view] = [part for part, _ in plain]
+    filtered = is_filter(view, by_view[view][0].variant)
+    sizes = {} if filtered else _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
+    if filtered:
+        sizes, values = filter_sizes(by_view[view], state)
+    for name, (mean, sd) in sizes.items():
+        unit = units.get(name.split(".")[0], "1")
+        estimates[name] = _estimate(mean, sd, unit, positive=_positive(kind, name))
+        _put(values, name, mean, axes)
+    values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
+    values |= _words(claim, by_view[view][0], state)
+    return Fitted(claim, axes, estimates, _instance(kind, values, axes, claim.driver), next((note for _, note in plain if note), ""))
+
+
+def _positive(kind: type[Effect], name: str) -> bool:
+    return next((item.low >= 0.0 for item in kind.parameters() if item.name == name.split(".")[0]), False)
+
+
+def _put(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...]) -> None:
+    """A value by its name; "name.axis" goes to its place in a list."""
+    base, _, axis = name.partition(".")
+    if not axis:
+        values[base] = value
+        return
+    known = values.setdefault(base, [0.0] * len(axes))
+    known[axes.index(axis)] = value
+
+
+def _words(claim: Claim, part: Part, state: State) -> dict[str, Any]:
+    """What the model needs beside the numbers."""
+    if claim.effect == "rotation_line":
+        return {"harmonics": 1.0}
+    if claim.effect == "feedback_reset" and "ramp_turns" in state.reduced:
+        low, high = (float(state.reduced["ramp_turns"].attrs[name]) for name in ("low", "high"))
+        return {"phase": "channel", "full": float(part.variant.values.get("full", 1.0)) * (high - low)}
+    if claim.effect == "held_samples":
+        return {"fill": "zero" if part.variant.columns[0] == "zeros" else "repeat"}
+    if claim.effect == "spikes":
+        return {"kind": "outlier"}
+    if claim.effect == "real_motion" and part.candidate.view == "line":
+        return {}
+    return {}
+
+
+def _instance(kind: type[Effect], values: Mapping[str, Any], axes: tuple[str, ...], driver: tuple[str, ...]) -> Effect | None:
+    known = {item.name: item for item in kind.parameters()}
+    clean = {}
+    for name, value in values.items():
+        if name in known:
+            item = known[name]
+            clean[name] = value if isinstance(value, str) else _within(value, item.low, item.high)
+    named = tuple(driver) if driver and all(driver) else ()
+    size = {name: 0.0 for name in kind.required() if name not in clean}
+    try:
+        return kind(axes=axes, driver=named, **{**size, **clean})
+    except (GyrostabError, TypeError):
+        return None
+
+
+def _within(value: Any, low: float, high: float) -> Any:
+    if isinstance(value, list | tuple):
+        return [min(max(float(one), low), high) for one in value]
+    return min(max(float(value), low), high)
+
+
+def _estimate(mean: float, sd: float, unit: str, *, positive: bool) -> Estimate:
+    """With the error of the form in it."""
+    total = math.hypot(sd, FORM_ERROR * mean) if sd > 0.0 else 0.0  # what is counted, not measured, is exact
+    low, high = mean - _TWO_SIDED * total, mean + _TWO_SIDED * total
+    return Estimate(mean, total, max(low, 0.0) if positive else low, high, unit)
+
+
+# ---------------------------------------------------------------------------------------------------------------- sizes
+
+
+def _family(part: Part, naming: Naming) -> list[Variant]:
+    """Variants of the part with the same columns: the nuisance grid."""
+    candidate = next(
+        (one for one in naming.candidates if one.key == part.candidate.key and one.view == part.candidate.view), part.candidate
+    )
+    return [one for one in candidate.variants if one.columns == part.variant.columns and one.squared == part.variant.squared]
+
+
+def _mixture(part: Part, state: State, naming: Naming) -> tuple[Mixture, dict[str, tuple[float, float]]]:
+    """Sizes over the nuisance grid, and the nuisance parameters themselves (mean and standard deviation)."""
+    family = _family(part, naming)
+    several = [part_mixture(part, state, variant) for variant in family]
+    usual = _usual(part, family, [float(np.logaddexp.reduce(one.log_weight)) for one in several])
+    family, several = [family[place] for place in usual], [several[place] for place in usual]
+    merged = Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
+    share = np.exp([np.logaddexp.reduce(one.log_weight) for one in several] - np.logaddexp.reduce(merged.log_weight))
+    nuisance = {}
+    for name in {key for one in family for key, value in one.values.items() if not isinstance(value, str)}:
+        grid = np.array([float(one.values[name]) for one in family])
+        if np.ptp(grid) == 0.0 or not np.isfinite(grid).all():
+            continue
+        mean = float(share @ grid)
+        nuisance[name] = (mean, math.sqrt(max(float(share @ (grid - mean) ** 2), (0.3 * _spacing(grid, mean)) ** 2)))
+    return merged, nuisance
+
+
+def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
+    """Places of the variants with the default of every nuisance parameter that the grid has it of, unless others are clearly better."""
+    known = {item.name: item.default for item in effects()[part.candidate.effect].parameters()}
+    plain = [
+        place
+        for place, one in enumerate(family)
+        if all(value == known[name] for name, value in one.values.items() if any(other.values[name] == known[name] for other in family))
+    ]
+    top = max(evidence)
+    return plain if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS else list(range(len(family)))
+
+
+def _spacing(grid: Array, place: float) -> float:
+    """Distance of the grid's values about a place."""
+    known = np.unique(grid)
+    nearest = int(np.abs(known - place).argmin())
+    return float(np.diff(known[max(nearest - 1, 0) : nearest + 2]).mean())
+
+
+def _linear(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    """Parameters of means, powers, profiles and transfers; by axis where there are several."""
+    out: dict[str, tuple[float, float]] = {}
+    for part in parts:
+        if part.variant.columns[:1] == ("any",):
+            continue
+        mixture, nuisance = _mixture(part, state, naming)
+        mean, covariance = mixture.moments()
+        for number, name in enumerate(part.variant.columns):
+            value, sd = float(mean[number]), float(math.sqrt(covariance[number, number]))
+            if part.variant.squared:
+                value, sd = _root(value, sd)
+            out[name if len(axes) == 1 else f"{name}.{part.row[0]}"] = (value, sd)
+        out |= nuisance
+    return out
+
+
+def _root(square: float, sd: float) -> tuple[float, float]:
+    """Size and its error from those of the square."""
+    value = math.sqrt(max(square, 0.0))
+    return value, sd / (2.0 * value) if square > sd else math.sqrt(max(square, 0.0) + sd) - value
+
+
+def _common(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    """Factor of every axis from the products of pairs."""
+    name = parts[0].variant.columns[0]
+    pairs = [pair for pair in pair_rows(state.reduced) if set(pair) <= set(axes)]
+    variant = parts[0].variant
+    product, error = np.zeros((len(axes), len(axes))), np.zeros((len(axes), len(axes)))
+    for pair in pairs:
+        mean, covariance = part_mixture(replace(parts[0], row=pair), state, variant).moments()
+        i, j = axes.index(pair[0]), axes.index(pair[1])
+        product[i, j] = product[j, i] = mean[0]
+        error[i, j] = error[j, i] = math.sqrt(covariance[0, 0])
+    best = _factors(product)
+    rng = np.random.default_rng(0)
+    draws = []
+    for _ in range(200):
+        noise = np.triu(rng.standard_normal(product.shape), 1) * error
+        one = _factors(product + noise + noise.T)
+        draws.append(one if one @ best >= 0 else -one)
+    spread = np.std(draws, axis=0)
+    return {name if len(axes) == 1 else f"{name}.{axis}": (float(best[k]), float(spread[k])) for k, axis in enumerate(axes)}
+
+
+def _factors(product: Array) -> Array:
+    """Factors whose products are nearest to a matrix off its diagonal, the largest positive."""
+    matrix = product.copy()
+    for _ in range(50):
+        values, vectors = np.linalg.eigh(matrix)
+        factor = vectors[:, -1] * math.sqrt(max(values[-1], 0.0))
+        np.fill_diagonal(matrix, factor**2)
+    return np.asarray(factor * np.sign(factor[np.abs(factor).argmax()] or 1.0))
+
+
+def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down."""
+    out: dict[str, tuple[float, float]] = {}
+    for part in parts:
+        mean, covariance = part_mixture(part, state).moments()
+        size = float(math.hypot(mean[0], mean[1]))
+        sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
+        angle, turn = math.degrees(math.atan2(mean[1], mean[0])), math.degrees(sd / max(size, 1e-300))
+        if not part.candidate.each:
+            across = size * float(np.abs(part.variant.design).max())
+            latitude = math.degrees(math.acos(min(across / 15.041067, 1.0)))
+            slope = 15.041067 * max(math.sin(math.radians(latitude)), 0.05)
+            return {"latitude": (latitude, math.degrees(sd * across / max(size, 1e-300) / slope)), "toolface": (angle, turn)}
+        label = "" if len(axes) == 1 else f".{part.row[0]}"
+        out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, turn)}
+        out["order"] = (float(state.reduced["harmonic"].values[part.place % state.reduced.sizes["harmonic"]]), 0.0)
+    return out
+
+
+def _line(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    name = {"real_motion": "sway"}.get(parts[0].candidate.effect, parts[0].variant.columns[0])
+    out: dict[str, tuple[float, float]] = {}
+    for part in sorted(parts, key=lambda part: part.gain):  # of several lines of an axis the strongest
+        amplitude, frequency = line_size(state.reduced, part.row[0], part.place)
+        label = "" if len(axes) == 1 or name == "sway" else f".{part.row[0]}"
+        out[f"{name}{label}"], out["frequency"] = amplitude, frequency
+    return out
+
+
+def _odd(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    return mark_sizes(parts[0].candidate.effect, parts[0].variant.columns[0], parts[0].row[0], state.reduced, naming.tallies)
+
+
+_SIZES = {"cross": _common, "order": _turning, "line": _line, "marks": _odd}
+
+
+# --------------------------------------------------------------------------------------------------------------- limits
+
+
+def limits(naming: Naming) -> dict[str, Limit]:
+    """How large every effect that was not named may be.
+
+    Returns
+    -------
+    dict of str to Limit
+        95 % limit of the effect's first size, the largest over axes; of effects in means and powers.
+    """
+    named = {claim.effect for claim in naming.claims}
+    out = {}
+    for name, kind in effects().items():
+        if name in named:
+            continue
+        unit = next((item.unit for item in kind.parameters() if item.name in kind.size_parameters), "1")
+        if name in naming.reasons:
+            out[name] = Limit(math.nan, unit, naming.reasons[name])
+            continue
+        found = [_limit(one, naming.state) for one in naming.candidates if one.effect == name and one.view in ("mean", "power", "cross")]
+        known = [(value, column) for value, column in found if math.isfinite(value)]
+        if not known:
+            out[name] = Limit(math.nan, unit, "not identifiable: free noise does as much" if found else "below limit")
+            continue
+        value, column = max(known)
+        unit = next((item.unit for item in kind.parameters() if item.name == column), unit)
+        out[name] = Limit(value, unit, "below limit")
+    return out
+
+
+def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
+    """Limit of the first parameter at the middle of its nuisance grid, largest over the rows."""
+    if not candidate.variants[0].columns:
+        return math.nan, ""
+    first = [one for one in candidate.variants if one.columns == candidate.variants[0].columns]
+    variant = first[len(first) // 2]
+    rows = pair_rows(state.reduced) if candidate.view == "cross" else [(axis,) for axis in state.axes]
+    worst = -math.inf
+    for row in rows:
+        number = state.axes.index(row[0])
+        if candidate.view == "mean" and not np.ptp(mean_columns(variant, number)[0]) > 0.0:
+            continue
+        mean, covariance = part_mixture(Part(candidate, variant, row, 0.0), state).moments()
+        value, sd = float(mean[0]), math.sqrt(max(float(covariance[0, 0]), 0.0))
+        if not math.isfinite(sd):
+            continue
+        worst = max(worst, math.sqrt(max(value, 0.0) + _ONE_SIDED * sd) if variant.squared else abs(value) + _ONE_SIDED * sd)
+    return (worst if worst > -math.inf else math.nan), variant.columns[0]

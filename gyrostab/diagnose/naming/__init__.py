@@ -1,0 +1,1 @@
+"""Which effects explain the difference, what cannot be told, and what is unknown."""

@@ -1,0 +1,114 @@
+"""Filters of the logger: their size from the shape of the spectrum, and lines that are nothing but its slope."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.calibration.expected import common_variance, noise_powers
+from gyrostab.diagnose.calibration.posterior import Fit, expected_of
+from gyrostab.diagnose.effects.candidates import Candidate
+from gyrostab.diagnose.effects.cells import State
+from gyrostab.diagnose.effects.explained import Part, explain_away
+from gyrostab.diagnose.effects.response import is_filter, response_of
+from gyrostab.diagnose.effects.search import gains
+from gyrostab.physics.registry import effects
+
+__all__ = ["filter_sizes", "without_slopes"]
+
+Array = NDArray[np.float64]
+_KEPT = 0.5  # of its gain, that a line must keep beside a filter
+_FINE, _ZOOMS = 21, 4
+
+
+def without_slopes(passing: list[str], parts: Mapping[str, list[Part]], state: State, folds: xr.DataArray) -> list[str]:
+    """Keys without lines that are gone, or nearly so, when the spectrum is straightened by a filter that passes as well.
+
+    A line is judged by its neighbours, so that the steep slope of a filter, or the lobes of an average, look like one.
+    """
+    lines = [key for key in passing if parts[key][0].candidate.view == "line"]
+    filters = [key for key in passing if any(is_filter(part.candidate.view, part.variant) for part in parts[key])]
+    if not lines or not filters:
+        return passing
+    trial = explain_away(state, list(parts[filters[0]]))
+    again = gains(_candidates(parts, lines), trial.reduced, trial, folds)
+    left = {one.candidate.key: float(np.maximum(one.gain[0], 0.0).sum()) for one in again}
+    before = {key: sum(max(part.gain, 0.0) for part in parts[key]) for key in lines}
+    return [key for key in passing if key not in lines or left.get(key, 0.0) > _KEPT * before[key]]
+
+
+def _candidates(parts: Mapping[str, list[Part]], keys: Iterable[str]) -> list[Candidate]:
+    return [parts[key][0].candidate for key in keys]
+
+
+def filter_sizes(parts: Sequence[Part], state: State) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
+    """Cutoff or length of a filter, and the words beside it, by the likelihood of the powers of all its axes with free noise.
+
+    Returns
+    -------
+    sizes : dict of str to (float, float)
+        The one parameter that is measured, with its error.
+    others : dict of str to float
+        Order, and what the samples are.
+    """
+    kind = effects()[parts[0].candidate.effect]
+    fits = [_fit(part.row[0], state) for part in parts]
+
+    def likelihood(values: Mapping[str, Any]) -> float:
+        response = response_of(kind.example(**values), state.reduced)
+        return sum(_likelihood(fit, response) for fit in fits)
+
+    family = [one.values for one in parts[0].candidate.variants if is_filter("power", one)]
+    best = max(family, key=likelihood)
+    name = "cutoff" if best["cutoff"] else "length"
+    others = {key: float(value) for key, value in best.items() if key != name}
+    if name == "length" and best["instrument"] == 1.0:
+        return {name: (float(best[name]), 0.0)}, others  # a count of samples
+    alike = sorted({float(one[name]) for one in family if all(one[key] == best[key] for key in others)})
+    return {name: _zoomed(alike, float(best[name]), lambda value: likelihood({**best, name: value}))}, others
+
+
+def _zoomed(grid: Sequence[float], start: float, likelihood: Callable[[float], float]) -> tuple[float, float]:
+    """Mean and standard deviation of a parameter about the best point of its grid, by a likelihood."""
+    place = grid.index(start)
+    low, high = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
+    mean, sd = start, (high - low) / 4.0
+    for _ in range(_ZOOMS):
+        values = np.linspace(low, high, _FINE)
+        log = np.array([likelihood(value) for value in values])
+        weight = np.exp(log - log.max())
+        weight /= weight.sum()
+        mean = float(weight @ values)
+        sd = max(float(np.sqrt(weight @ (values - mean) ** 2)), 0.3 * (values[1] - values[0]))
+        low, high = max(mean - 5.0 * sd, low), min(mean + 5.0 * sd, high)
+    return mean, sd
+
+
+def _fit(axis: str, state: State) -> Fit:
+    """Powers of an axis averaged over the record, with the noise and what else is named free."""
+    reduced = state.reduced
+    row = state.axes.index(axis)
+    power, shape = (reduced[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape"))
+    use = np.where(np.isfinite(power) & np.isfinite(shape) & ~state.masked[row][:, None], shape, 0.0)
+    total = np.maximum(use.sum(axis=0), 1e-300)
+    common, alone = (one[row] for one in common_variance(reduced))
+    each = np.nansum(alone, axis=1)
+    share = min(1.0, float((each / (1.0 + common * each)).sum() / max(np.nansum(shape), 1e-300)))
+
+    def mean(values: Array) -> Array:
+        return np.asarray((use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total)
+
+    columns = np.stack([mean(noise_powers(reduced)[row][..., term]) for term in range(4)], axis=1)
+    beside = [mean(one) for one in state.given.get(("power", axis), [])]
+    free = np.stack([one / max(np.abs(one).max(), 1e-300) for one in beside], axis=1) if beside else None
+    return Fit(mean(power), columns, total * share, beside=free, start=mean(state.weight[row]))
+
+
+def _likelihood(fit: Fit, response: Array) -> float:
+    """Largest log likelihood of the powers with this response, over the noise."""
+    expected = expected_of(fit._replace(columns=fit.columns * response[:, None]))
+    return float(-(fit.weight * (np.log(expected) + fit.power / expected)).sum())

@@ -1,0 +1,80 @@
+"""What the data cannot tell by their nature, and sizes that physics does not allow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gyrostab.diagnose.effects.candidates import LARGEST
+from gyrostab.diagnose.effects.cells import State
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.reduction.reduced import measured
+from gyrostab.physics.registry import effects
+
+__all__ = ["PLAINER", "STRUCTURAL", "possible", "structural"]
+
+#: Effect -> effects that look the same in block statistics, whatever the excitation.
+STRUCTURAL: dict[str, tuple[str, ...]] = {
+    "gauss_markov": ("telegraph",),
+    "telegraph": ("gauss_markov",),
+    "spectral_line": ("real_motion", "supply_bias"),
+}
+#: Effect -> effect that it becomes where a parameter goes to its end: without play, hysteresis is proportional to temperature.
+PLAINER = {"thermal_hysteresis": "temperature_bias"}
+_SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
+_SURE = 3.0  # standard errors beyond its range, from which on a size is impossible
+_COMB = 3  # lines that may be one comb
+_MOVING = 1.5  # times the expected power, from which on an axis moves
+_LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
+
+
+def possible(parts: Sequence[Part], state: State) -> list[Part]:
+    """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not."""
+    return [part for part in parts if _possible(part, state)]
+
+
+def _possible(part: Part, state: State) -> bool:
+    from gyrostab.diagnose.effects.sizes import part_mixture, part_size
+
+    effect, view = part.candidate.effect, part.candidate.view
+    if effect == "misalignment" and view == "transfer" and not _moves(part.candidate.witness[0], state):
+        return False
+    if effect == "fringe_hop" and abs(part_size(part, state)[0]) * np.abs(part.variant.design).max() < _SMALLEST_FRINGE:
+        return False
+    if effect in LARGEST and part.variant.columns[0] != "any":
+        return bool(np.abs(part_mixture(part, state).moments()[0]).max() <= LARGEST[effect])
+    if view == "mean" and not _in_range(part, state):
+        return False
+    return not (part.variant.squared and view == "power" and part_size(part, state)[0] <= 0.0)
+
+
+def _in_range(part: Part, state: State) -> bool:
+    """Whether the sizes of block means can lie where the registry allows the parameters: an instrument that has others is broken."""
+    from gyrostab.diagnose.effects.sizes import part_mixture
+
+    largest = {item.name: max(abs(item.low), abs(item.high)) for item in effects()[part.candidate.effect].parameters()}
+    sizes, covariance = part_mixture(part, state).moments()
+    least = np.abs(sizes) - _SURE * np.sqrt(np.diagonal(covariance))
+    return all(size <= largest.get(name, np.inf) for name, size in zip(part.variant.columns, least, strict=True))
+
+
+def _moves(axis: str, state: State) -> bool:
+    """Whether an axis shows more than its noise at some frequency: what is at rest cannot leak in."""
+    row = state.axes.index(axis)
+    expected = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
+    return bool(np.nanmax(np.nanmean(measured(state.reduced, "power").values[row] / expected, axis=0)) > _MOVING)
+
+
+def structural(effect: str, parts: Sequence[Part], state: State, *, lines: int = 0) -> list[str]:
+    """Effects that are part of the answer by their nature; `lines` are named in all."""
+    out = list(STRUCTURAL.get(effect, ()))
+    reduced = state.reduced
+    if effect == "spectral_line" and "profile" not in reduced and lines >= _COMB:
+        out.append("feedback_reset")
+    if effect == "vibration_rectification":
+        vibration = reduced[f"channel_{parts[0].candidate.driver[0]}"].values
+        good = np.isfinite(vibration)
+        if np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1] > _LEVELS:
+            out.append("g_sensitivity")
+    return out
