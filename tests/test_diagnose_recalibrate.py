@@ -101,6 +101,33 @@ def test_what_axes_share_is_no_noise_of_their_own():
     np.testing.assert_allclose(after["spectrum"].median(), baseline["spectrum"].median(), rtol=0.05)
 
 
+def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
+    shaken = {
+        "profile": "vibration",
+        "points": [[0, 0.02], [600, 0.02], [601, 6.0], [1200, 6.0], [1201, 0.02], [1800, 0.02]],
+        "band": [17.5, 20.0],
+    }
+    reduced = reduced_of({"name": "aliased_vibration", "sensitivity": 0.3, "low": 17.5, "high": 20.0}, environment=[shaken])
+    baseline = calibrate(reduced)
+    known, reasons = effect_candidates(reduced, baseline["coefficient"])
+    views = {one.view: one for one in known if one.effect == "aliased_vibration"}
+    variants = {view: next(each for each in one.variants if each.values["sampling"] == "point") for view, one in views.items()}
+    places = [("power", ("x",)), ("power", ("y",)), ("cross", ("x", "y"))]
+    parts = tuple(Part(views[view], variants[view], row, 500.0) for view, row in places)
+    claim = Claim("aliased_vibration", views["power"].driver, ("x", "y"), parts, 500.0, 8.0)
+    state = explain_away(begin_state(reduced, baseline), list(parts))
+    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced))
+    first = fit_claims(naming, baseline)
+    noise = recalibrate(naming, baseline, first)
+    for fitted in (first, fit_claims(with_noise(naming, noise), noise)):
+        sizes = [one.value for name, one in fitted[0].parameters.items() if name.startswith("sensitivity")]
+        assert sizes
+        assert sizes == pytest.approx([0.3] * len(sizes), rel=0.1)
+    for axis in "xy":
+        value, error = noise_of(noise, "N", axis)
+        assert abs(value - 0.003) < 3.0 * error
+
+
 @pytest.mark.parametrize(
     ("table", "grid"),
     [
