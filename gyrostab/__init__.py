@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from gyrostab.correlate import correlation_rows as correlation_rows
     from gyrostab.davar import davar as davar
     from gyrostab.diagnose.core import diagnose as diagnose
-    from gyrostab.diagnosis import open_diagnosis as open_diagnosis
-    from gyrostab.diagnosis import write_diagnosis as write_diagnosis
+    from gyrostab.diagnosis_folder import open_diagnosis as open_diagnosis
+    from gyrostab.diagnosis_folder import write_diagnosis as write_diagnosis
     from gyrostab.export import open_log as open_log
     from gyrostab.export import open_product as open_product
     from gyrostab.export import open_surface as open_surface
@@ -62,7 +62,7 @@ _HOME = {
     "gap_table": "regularise",
     "make_log": "log",
     "make_noise": "simulate",
-    "open_diagnosis": "diagnosis",
+    "open_diagnosis": "diagnosis_folder",
     "open_log": "export",
     "open_product": "export",
     "open_surface": "export",
@@ -83,7 +83,7 @@ _HOME = {
     "to_kalibr": "kalibr",
     "to_netcdf": "export",
     "to_zarr": "export",
-    "write_diagnosis": "diagnosis",
+    "write_diagnosis": "diagnosis_folder",
     "write_report": "report",
 }
 

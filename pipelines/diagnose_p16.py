@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import gyrostab
-from gyrostab.diagnosis.figures import plot_change
+from gyrostab.plot.diagnosis import plot_change
 from gyrostab.plot.style import save_png
 
 

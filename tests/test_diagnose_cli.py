@@ -17,7 +17,7 @@ from gyrostab.diagnose.conclusion.result import check_diagnosis
 from gyrostab.diagnose.core import diagnose, quiet_span
 from gyrostab.diagnose.effects.candidates import Candidate, Variant
 from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnosis.files import FILES
+from gyrostab.diagnosis_folder import FILES
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.export import to_netcdf
 from gyrostab.log import make_log

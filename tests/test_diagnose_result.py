@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 
 from gyrostab.diagnose.conclusion.result import VERDICTS, Diagnosis, check_diagnosis, effect_table, model_text, plain
 from gyrostab.diagnose.conclusion.sentences import chance, clock, mismatch_statement, next_measurement, plain_name, summary
-from gyrostab.diagnosis import open_diagnosis, write_diagnosis, write_diagnosis_report
-from gyrostab.diagnosis.files import FILES
+from gyrostab.diagnosis_folder import FILES, open_diagnosis, write_diagnosis
 from gyrostab.errors import FormatError, OutputError, SchemaError
 from gyrostab.physics.registry import effects, make_effect
+from gyrostab.report import write_diagnosis_report
 from gyrostab.simulate import read_model, simulate
 
 from .command_line import call
@@ -30,7 +30,7 @@ from .diagnosed import content, diagnosis, model, surfaces
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages of words alone, for tests that are about something else."""
-    monkeypatch.setattr("gyrostab.diagnosis.page._figures", lambda _: [])
+    monkeypatch.setattr("gyrostab.report.diagnosis._figures", lambda _: [])
 
 
 plain_pages = pytest.mark.usefixtures("without_figures")
@@ -177,7 +177,7 @@ def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.Monkey
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gyrostab.diagnosis.files.to_netcdf", fail)
+    monkeypatch.setattr("gyrostab.diagnosis_folder.to_netcdf", fail)
     with pytest.raises(OutputError):
         write_diagnosis(diagnosis(), tmp_path / "found")
     assert list(tmp_path.iterdir()) == []

@@ -58,8 +58,7 @@ def diagnose(
     """
     from gyrostab.diagnose.core import diagnose as run_diagnosis
     from gyrostab.diagnose.core import quiet_span
-    from gyrostab.diagnosis import write_diagnosis
-    from gyrostab.diagnosis.files import check_folder
+    from gyrostab.diagnosis_folder import check_folder, write_diagnosis
     from gyrostab.run import load_log
 
     check_folder(output, overwrite=common.overwrite)

@@ -36,9 +36,9 @@ def report(
     log
         Log that the product was made of, to show the signal too.
     """
-    from gyrostab.diagnosis import open_diagnosis, write_diagnosis_report
+    from gyrostab.diagnosis_folder import open_diagnosis
     from gyrostab.export import open_log, open_product
-    from gyrostab.report import write_report
+    from gyrostab.report import write_diagnosis_report, write_report
     from gyrostab.run import check_output
 
     target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite, inputs=[product])

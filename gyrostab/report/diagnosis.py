@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from datetime import UTC, datetime
-from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from gyrostab.diagnose.conclusion.sentences import axes_text, length_text, next_
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
 from gyrostab.plot.style import embedded
+from gyrostab.report.page import page_text
 
 __all__ = ["write_diagnosis_report"]
 
@@ -60,18 +59,13 @@ def write_diagnosis_report(diagnosis: Diagnosis, path: str | os.PathLike[str], *
     OutputError
         When the file exists, or cannot be written.
     """
-    import jinja2
-
     content = diagnosis.content
     check_diagnosis(content)
-    source = resources.files("gyrostab.diagnosis").joinpath("page.html.jinja").read_text(encoding="utf-8")
-    template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(source)
     with new_output(path, overwrite=overwrite) as temporary:
-        text = template.render(
+        text = page_text(
+            "diagnosis.html.jinja",
             title="Gyro diagnosis",
             recording=_recording(content),
-            made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            version=metadata.version("gyrostab"),
             verdict=content["verdict"],
             summary=summary(content),
             facts=_facts(content),
@@ -203,7 +197,7 @@ def _noise(content: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    from gyrostab.diagnosis.figures import plot_change, plot_deviations, plot_means, plot_spectra, plot_surfaces
+    from gyrostab.plot.diagnosis import plot_change, plot_deviations, plot_means, plot_spectra, plot_surfaces
 
     surfaces, content = diagnosis.surfaces, diagnosis.content
     return [

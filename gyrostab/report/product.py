@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-from datetime import UTC, datetime
-from importlib import metadata, resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -14,10 +12,8 @@ import xarray as xr
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
 from gyrostab.plot.style import duration, embedded
+from gyrostab.report.page import page_text
 from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_log, check_product
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["write_report"]
 
@@ -51,20 +47,15 @@ def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.D
     OutputError
         When the file exists, or cannot be written.
     """
-    import jinja2
-
     check_product(product)
     if log is not None:
         check_log(log)
-    source = resources.files("gyrostab").joinpath("report.html.jinja").read_text(encoding="utf-8")
-    template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(source)
     table = [(str(name), _coefficients(product.sel(axis=name))) for name in product["axis"].values]
     gaps = None if log is None or "gap_start" not in log.variables else _gaps(log)
     with new_output(path, overwrite=overwrite) as temporary:
-        text = template.render(
+        text = page_text(
+            "product.html.jinja",
             title="Gyro stability report",
-            made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            version=_version(),
             summary=_summary(product),
             findings=_findings(product, table),
             facts=_facts(product),
@@ -77,13 +68,6 @@ def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.D
         )
         temporary.write_text(text, encoding="utf-8")
     return Path(path)
-
-
-def _version() -> str:
-    try:
-        return metadata.version("gyrostab")
-    except metadata.PackageNotFoundError:
-        return ""
 
 
 def _lines(value: Any) -> list[str]:

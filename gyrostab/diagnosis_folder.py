@@ -10,11 +10,12 @@ from pathlib import Path
 import xarray as xr
 
 from gyrostab.diagnose.conclusion.result import Diagnosis, check_diagnosis, model_text
-from gyrostab.errors import FormatError, SchemaError
+from gyrostab.errors import FormatError, OutputError, SchemaError
 from gyrostab.export import open_dataset, to_netcdf
 from gyrostab.output import new_output
+from gyrostab.report import write_diagnosis_report
 
-__all__ = ["FILES", "open_diagnosis", "write_diagnosis"]
+__all__ = ["FILES", "check_folder", "open_diagnosis", "write_diagnosis"]
 
 #: Files of the folder.
 FILES = ("diagnosis.json", "model.toml", "diagnosis.nc", "report.html")
@@ -44,8 +45,6 @@ def write_diagnosis(diagnosis: Diagnosis, directory: str | os.PathLike[str], *, 
     OutputError
         When the folder exists, or cannot be written.
     """
-    from gyrostab.diagnosis.page import write_diagnosis_report
-
     check_diagnosis(diagnosis.content)
     directory = Path(directory)
     check_folder(directory, overwrite=overwrite)
@@ -59,8 +58,6 @@ def write_diagnosis(diagnosis: Diagnosis, directory: str | os.PathLike[str], *, 
 
 def check_folder(directory: Path, *, overwrite: bool) -> None:
     """Raise `OutputError` before the long work when the folder cannot be made, or holds something else that would be lost."""
-    from gyrostab.errors import OutputError
-
     if not directory.parent.is_dir():
         raise OutputError(f"output {str(directory)!r}: there is no directory {str(directory.parent)!r}; make it first or choose another")
     if directory.exists() and not directory.is_dir():

@@ -1,0 +1,6 @@
+"""Pages that people read: of a product, and of a diagnosis, each one HTML file that needs nothing beside it."""
+
+from gyrostab.report.diagnosis import write_diagnosis_report as write_diagnosis_report
+from gyrostab.report.product import write_report as write_report
+
+__all__ = ["write_diagnosis_report", "write_report"]

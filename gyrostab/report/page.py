@@ -1,0 +1,30 @@
+"""Fill in a template of this folder, as one HTML file."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Any
+
+__all__ = ["page_text"]
+
+
+def page_text(template: str, *, title: str, **content: Any) -> str:
+    """Text of a page that says when and by which version it was made.
+
+    Parameters
+    ----------
+    template : str
+        Name of the template, which extends ``frame.html.jinja``.
+    title : str
+        Title and heading.
+    **content
+        What the template asks for.
+    """
+    import jinja2
+
+    templates = jinja2.Environment(
+        loader=jinja2.PackageLoader("gyrostab", "report"), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return templates.get_template(template).render(title=title, made=made, version=metadata.version("gyrostab"), **content)
