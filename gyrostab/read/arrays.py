@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Column, Plan
-from gyrostab.read.intake import Intake, summary_notes, summary_stamp
+from gyrostab.read.intake import Intake, summary_of
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.stamps import NAT, cells_to_ns, floats_to_ns, integers_to_ns, looks_iso
 
@@ -91,7 +90,7 @@ def take_batch(intake: Intake, options: ReadOptions, batch: dict[int, Any]) -> N
 
 def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:
     """A warning when the stamps are stored with 24 bits only."""
-    time = next(iter(plan.of("time")), None)
+    time = plan.time
     if time is None or str(dtypes[time.source]) not in ("float32", "float", ">f4", "<f4"):
         return []
     return [
@@ -99,23 +98,10 @@ def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:
     ]
 
 
-def summarise(path: Path, form: str, plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, notes: Sequence[str] = ()) -> FileSummary:
+def summarise(form: str, plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, notes: Sequence[str] = ()) -> FileSummary:
     """A summary with the first and last stamps fetched from the two ends."""
-    first = last = None
-    time = next(iter(plan.of("time")), None)
-    if time is not None and rows:
-        head = to_stamps(fetch(time.source, 0, min(ENDS, rows)), time, options)
-        tail = to_stamps(fetch(time.source, max(0, rows - ENDS), rows), time, options)
-        first = next((int(stamp) for stamp in head if stamp != NAT), None)
-        last = next((int(stamp) for stamp in tail[::-1] if stamp != NAT), None)
-    return FileSummary(
-        path=path,
-        format=form,
-        columns=plan.summaries,
-        axes=tuple(column.name for column in plan.of("gyro")),
-        channels=tuple(column.name for column in plan.of("channel")),
-        first=summary_stamp(first),
-        last=summary_stamp(last),
-        n_rows=rows,
-        notes=summary_notes(plan, notes),
-    )
+    time = plan.time
+    if time is None or not rows:
+        return summary_of(plan, form, rows, notes=notes)
+    head, tail = (to_stamps(fetch(time.source, *span), time, options) for span in ((0, min(ENDS, rows)), (max(0, rows - ENDS), rows)))
+    return summary_of(plan, form, rows, head=head, tail=tail, notes=notes)

@@ -40,14 +40,14 @@ class Typing:
     def __post_init__(self) -> None:
         self.sources = [column.source for column in self.plan.columns if column.role != "time"]
         self.gyro = frozenset(column.source for column in self.plan.of("gyro"))
-        self.time = next((column.source for column in self.plan.of("time")), None)
+        self.time = self.plan.time.source if self.plan.time else None
         unit = self.unit
         self.digits = unit.digits if unit is not None and unit.digits is not None and unit.digits <= 9 else 0
 
     @property
     def unit(self) -> TimeUnit | None:
         """Unit of a numeric time column."""
-        return next((column.time_unit for column in self.plan.of("time")), None)
+        return self.plan.time.time_unit if self.plan.time else None
 
 
 def parse_plain(block: bytes, start: int, rows: int, typing: Typing) -> tuple[Parsed, int]:
@@ -86,7 +86,7 @@ def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
     """
     import pyarrow as pa
 
-    time = next(iter(plan.of("time")), None)
+    time = plan.time
     if time is None:
         return (None,)
     cells = [row[time.source] for row in layout.samples if len(row) == layout.width]
@@ -149,7 +149,7 @@ def _stamps(column: Any, typing: Typing) -> NDArray[np.int64]:
 
     kind = column.type
     if pa.types.is_decimal(kind):
-        digits = typing.plan.of("time")[0].time_unit.digits  # type: ignore[union-attr]
+        digits = typing.unit.digits  # type: ignore[union-attr]
         if kind.scale != digits:
             import pyarrow.compute as compute
 
@@ -161,7 +161,7 @@ def _stamps(column: Any, typing: Typing) -> NDArray[np.int64]:
 def _chunk_stamps(chunk: Any, typing: Typing) -> NDArray[np.int64]:
     import pyarrow as pa
 
-    unit = typing.plan.of("time")[0].time_unit
+    unit = typing.unit
     valid = np.ones(len(chunk), dtype=bool) if chunk.null_count == 0 else chunk.is_valid().to_numpy(zero_copy_only=False)
     buffer = chunk.buffers()[1]
     if pa.types.is_decimal(chunk.type):
@@ -238,4 +238,4 @@ def _cell_stamps(rows: list[list[str] | None], typing: Typing) -> NDArray[np.int
     cells = ["" if row is None else row[typing.time] for row in rows]
     if typing.layout.decimal_comma:
         cells = [cell.replace(",", ".") for cell in cells]
-    return cells_to_ns(cells, typing.plan.of("time")[0].time_unit, typing.options.epoch_ns)
+    return cells_to_ns(cells, typing.unit, typing.options.epoch_ns)

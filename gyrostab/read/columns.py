@@ -76,6 +76,11 @@ class Plan:
         """The columns of a role."""
         return [column for column in self.columns if column.role == role]
 
+    @property
+    def time(self) -> Column | None:
+        """The column of stamps."""
+        return next(iter(self.of("time")), None)
+
 
 @dataclass
 class _Header:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.read.buffers import SPILL_BYTES, Buffers, Stored, lazily, put, take, together
 from gyrostab.read.columns import Column, Plan
-from gyrostab.read.options import ReadOptions
+from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.stamps import NAT
 from gyrostab.schema import SIGNAL_UNITS
 
-__all__ = ["Intake", "summary_notes", "summary_stamp"]
+__all__ = ["Intake", "summary_of"]
 
 #: How many bad places a note names.
 NAMED = 10
@@ -46,7 +46,7 @@ class Intake:
 
     def __init__(self, plan: Plan, options: ReadOptions, *, limit: int = SPILL_BYTES):
         self.plan, self.options = plan, options
-        self.time = next(iter(plan.of("time")), None)
+        self.time = plan.time
         self.gyro, self.channels = plan.of("gyro"), plan.of("channel")
         dtypes: dict[int, Any] = {column.source: np.float64 for column in [*self.gyro, *self.channels]}
         if self.time is not None:
@@ -205,11 +205,39 @@ def _places(places: Sequence[str], total: int) -> str:
     return f"{kind}{'s' * (len(places) > 1)} {numbers}{' and others' * (total > len(places))}"
 
 
-def summary_notes(plan: Plan, notes: Sequence[str] = ()) -> tuple[str, ...]:
-    """The notes of a `FileSummary`: what the reader and the plan of the columns say, and what stands in the way of reading."""
-    return (*(f"{plan.path.name}: {note}" for note in [*notes, *plan.notes]), *(str(problem) for problem in plan.problems))
+def summary_of(
+    plan: Plan,
+    form: str,
+    rows: int | None,
+    *,
+    head: Sequence[int] | NDArray[np.int64] = (),
+    tail: Sequence[int] | NDArray[np.int64] = (),
+    notes: Sequence[str] = (),
+) -> FileSummary:
+    """What a cheap look tells of a file.
 
-
-def summary_stamp(stamp: int | None) -> np.datetime64 | None:
-    """A stamp for a `FileSummary`."""
-    return None if stamp is None or stamp == NAT else np.datetime64(stamp, "ns")
+    Parameters
+    ----------
+    plan : Plan
+        What each column is, and what stands in the way of reading.
+    form : str
+        Name of the format.
+    rows : int or None
+        Number of rows, where it is known.
+    head, tail : sequence of int
+        Stamps at the two ends [ns since 1970], `NAT` where unreadable.
+    notes : sequence of str
+        What the reader says.
+    """
+    first, last = (next((np.datetime64(int(stamp), "ns") for stamp in end if stamp != NAT), None) for end in (head, tail[::-1]))
+    return FileSummary(
+        path=plan.path,
+        format=form,
+        columns=plan.summaries,
+        axes=tuple(column.name for column in plan.of("gyro")),
+        channels=tuple(column.name for column in plan.of("channel")),
+        first=first,
+        last=last,
+        n_rows=rows,
+        notes=(*(f"{plan.path.name}: {note}" for note in [*notes, *plan.notes]), *(str(problem) for problem in plan.problems)),
+    )

@@ -57,7 +57,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     with ExitStack() as stack:
         vectors, plan, notes = _look(path, options, stack)
         name = "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab"
-        return summarise(path, name, plan, options, vectors[0].rows, lambda source, a, b: vectors[source].part(a, b), notes)
+        return summarise(name, plan, options, vectors[0].rows, lambda source, a, b: vectors[source].part(a, b), notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:

@@ -63,7 +63,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
     with netCDF4.Dataset(path) as file:
         columns, rows, plan, notes = _look(path, file, options)
-        return summarise(path, "netcdf", plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes)
+        return summarise("netcdf", plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:

@@ -35,7 +35,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         values = _plain(file.read_row_group(group, columns=[file.schema_arrow.names[source]]).column(0))
         return values[: stop - start] if start == 0 else values[start - stop :]
 
-    return summarise(path, "parquet", plan, options, file.metadata.num_rows, fetch)
+    return summarise("parquet", plan, options, file.metadata.num_rows, fetch)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:

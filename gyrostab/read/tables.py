@@ -107,7 +107,7 @@ def scan_tables(path: Path, form: str, tables: Sequence[Table], options: ReadOpt
     """A summary, with the first and last stamps of the table of the gyro axes."""
     planned = _plan(path, tables, options)
     plan, fetch = planned.part(planned.main)
-    summary = summarise(path, form, plan, options, planned.tables[planned.main].rows, fetch, notes)
+    summary = summarise(form, plan, options, planned.tables[planned.main].rows, fetch, notes)
     return replace(summary, channels=tuple(column.name for column in planned.plan.of("channel")))
 
 

@@ -25,10 +25,10 @@ from gyrostab.errors import FormatError
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.cells import Typing, parse_cells, parse_fast, parse_plain, stamp_types
 from gyrostab.read.columns import Column, Plan, plan_columns
-from gyrostab.read.intake import Intake, summary_notes, summary_stamp
+from gyrostab.read.intake import Intake, summary_of
 from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line
 from gyrostab.read.options import FileSummary, ReadOptions
-from gyrostab.read.stamps import NAT, cells_to_ns, looks_iso
+from gyrostab.read.stamps import cells_to_ns, looks_iso
 
 __all__ = ["matches", "read", "scan"]
 
@@ -52,33 +52,21 @@ def matches(path: Path) -> bool:
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Header, columns, first and (of plain files) last stamp, from the two ends of the file."""
     layout, plan = _look(path, options)
-    time = next(iter(plan.of("time")), None)
-    first = last = n_rows = None
+    time, rows = plan.time, None
+    head = tail = np.empty(0, np.int64)
     if time is not None:
-        stamps = _stamps(layout, time, layout.samples, options)
-        first = next((int(stamp) for stamp in stamps if stamp != NAT), None)
+        head = _stamps(layout, time, layout.samples, options)
     if not _gzipped(path):
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(layout.offset, size - 2**14))
-            tail = [split_line(line, layout.separator) for line in file.read().decode("latin-1").splitlines()]
+            ends = [split_line(line, layout.separator) for line in file.read().decode("latin-1").splitlines()]
             if time is not None:
-                ends = _stamps(layout, time, [row for row in tail if _is_solid(row, layout, time.source)], options)
-                last = next((int(stamp) for stamp in ends[::-1] if stamp != NAT), None)
+                tail = _stamps(layout, time, [row for row in ends if _is_solid(row, layout, time.source)], options)
             if size <= COUNTED_BYTES:
                 file.seek(layout.offset)
-                n_rows = sum(1 for line in file if line.strip() and not line.lstrip().startswith((b"#", b"%")))
-    return FileSummary(
-        path=path,
-        format="text",
-        columns=plan.summaries,
-        axes=tuple(column.name for column in plan.of("gyro")),
-        channels=tuple(column.name for column in plan.of("channel")),
-        first=summary_stamp(first),
-        last=summary_stamp(last),
-        n_rows=n_rows,
-        notes=summary_notes(plan, layout.notes),
-    )
+                rows = sum(1 for line in file if line.strip() and not line.lstrip().startswith((b"#", b"%")))
+    return summary_of(plan, "text", rows, head=head, tail=tail, notes=layout.notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
