@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,7 +189,7 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
     parameters = {"weight": {"value": amplitude, "unit": "1"}}
     if kind == "pole":
         parameters["cutoff"] = {"value": -math.log(min(amplitude, 0.45)) * world.rate / (2 * math.pi), "unit": "Hz", "unless": ["length"]}
-    return Effect(**{**vars(effect), "after": after, "parameters": parameters})
+    return replace(effect, after=after, parameters=parameters)
 
 
 def _sample_sd(world: World, axis: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,7 +94,7 @@ def _shaking_noise(
     if name == "vibration_noise":  # white noise of the same power is what a flat model should find
         white = by_axis(np.abs(shares), amplitude * math.sqrt(float(density.mean())) / white_level(1.0))
         parameters["white"] = {"values": white, "unit": "deg/sqrt(h)/g", "unless": ["quantization", "exponent"]}
-    return Effect(**{**vars(effect), "extra": extra, "parameters": parameters})
+    return replace(effect, extra=extra, parameters=parameters)
 
 
 def vibration_noise(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -233,4 +234,4 @@ def misalignment(world: World, rng: np.random.Generator, *, strength: float) -> 
     mean = leak.mean.copy()
     mean[2] = mean[int(np.argmax(np.abs(shares)))] / angle
     parameters = leak.parameters | {"z": {"values": {AXES[int(np.argmax(shares))]: 1e3 * angle}, "unit": "mrad"}}
-    return Effect(**{**vars(leak), "mean": mean, "parameters": parameters, "beside": ("real_motion", "scale_factor")})
+    return replace(leak, mean=mean, parameters=parameters, beside=("real_motion", "scale_factor"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +109,7 @@ def informative_gaps(world: World, rng: np.random.Generator, *, strength: float)
     lost = np.repeat(rng.random(trouble.size) < 0.7 * trouble, math.ceil(world.rate))[: world.size]
     lost = lfilter(np.ones(3), [1.0], lost.astype(float)) > 0
     lost[: round(5 * world.rate)] = lost[-round(5 * world.rate) :] = False
-    gone = World(**{**vars(world), "missing": world.missing | lost})
+    gone = replace(world, missing=world.missing | lost)
     effect, _ = variance_effect(
         gone,
         lambda a: 1 + a * shares[:, None] * trouble[None, :],
@@ -121,4 +122,4 @@ def informative_gaps(world: World, rng: np.random.Generator, *, strength: float)
         first=1e-4,
         active=trouble > 0.1,
     )
-    return Effect(**{**vars(effect), "lost": lost})
+    return replace(effect, lost=lost)

@@ -20,7 +20,7 @@ def _band(low: float, high: float) -> Array:
     return np.asarray(signal.butter(2, [low, high], btype="bandpass", fs=FAST, output="sos"))
 
 
-def _power(sos: Array, low: float, high: float) -> float:
+def _power(sos: Array, low: float) -> float:
     """Variance of white noise of unit variance behind the filter."""
     f = np.geomspace(low / 30, FAST / 2 - 1e-6, 4000)
     gain = np.abs(signal.freqz_sos(sos, worN=f, fs=FAST)[1]) ** 2
@@ -39,7 +39,7 @@ def band_noise(rng: np.random.Generator, size: int, *, low: float, high: float) 
     sos = _band(low, high)
     settle = round(2 * FAST / low)
     x = signal.sosfilt(sos, rng.standard_normal(size + settle))[settle:]
-    return np.asarray(x / math.sqrt(_power(sos, low, high)))
+    return np.asarray(x / math.sqrt(_power(sos, low)))
 
 
 def mount_filter(resonance: float, *, quality: float) -> tuple[Array, Array]:
@@ -110,7 +110,7 @@ def folded_psd(frequency: Array, *, rate: float, kind: str, low: float, high: fl
     1.0
     """
     sos = _band(low, high)
-    level = 1.0 / (FAST * _power(sos, low, high))
+    level = 1.0 / (FAST * _power(sos, low))
     taps = decimator_taps(rate, kind)
     alias = (np.asarray(frequency)[None, :] + rate * np.arange(round(FAST / rate))[:, None]) % FAST
     flat = alias.ravel()

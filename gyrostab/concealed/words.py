@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +46,10 @@ def rate_quantization(world: World, rng: np.random.Generator, *, strength: float
     def after(record: Array) -> Array:
         return np.asarray((np.trunc if cut else np.rint)(record / step) * step)
 
-    return Effect(**{**vars(effect), "after": after, "parameters": {"step": {"value": step, "unit": "deg/h"}}})
+    return replace(effect, after=after, parameters={"step": {"value": step, "unit": "deg/h"}})
 
 
-def _stuck(world: World, strength: float) -> int:
+def _stuck(strength: float) -> int:
     """Number of samples that noise alone would not give, for a strength."""
     return max(2, math.ceil(NATS * strength**2 / _NEVER))
 
@@ -56,7 +57,7 @@ def _stuck(world: World, strength: float) -> int:
 def dead_zone(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """An axis that lies at zero rate, and a loop that holds what is nearest to zero and pulls at what is near."""
     axis = int(rng.integers(3))
-    number = _stuck(world, strength)
+    number = _stuck(strength)
     there = float((~world.missing).sum())
     width = number / there * _sample_sd(world, axis) * math.sqrt(math.pi / 2)  # so many normal samples lie within +- width
 
@@ -82,7 +83,7 @@ def dead_zone(world: World, rng: np.random.Generator, *, strength: float) -> Eff
 def clipping(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """A range that ends too soon on one side or both, hard or with a soft knee."""
     axis = int(rng.integers(3))
-    number = _stuck(world, strength)
+    number = _stuck(strength)
     both, soft = bool(rng.random() < 0.5), bool(rng.random() < 0.4)
 
     def after(record: Array) -> Array:

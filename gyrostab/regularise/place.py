@@ -161,7 +161,7 @@ def _windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
     return _Windows(low, high, reach, up.astype(np.int64), down.astype(np.int64)), int(first or 0)
 
 
-def _jumps(windows: _Windows, period: float, max_gap: float) -> tuple[list[tuple[int, float, int, float]], float]:
+def _jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]], float]:
     """Lasting shifts of the lower envelope: counted row, size [samples], window, envelope before; and the wander."""
     low = windows.low
     change = np.abs(np.diff(low))
@@ -206,7 +206,7 @@ def place_by_count(stamps: Stamps, estimate: RateEstimate, rate: float, *, max_g
     period = whole + fraction
     width = max(64, int(4 * rate))
     windows, first = _windows(stamps, period, width)
-    jumps, wander = _jumps(windows, period, max_gap * rate)
+    jumps, wander = _jumps(windows)
     edge = windows.high[0] if estimate.coarse else windows.low[0]
     start = first + int(np.rint(edge * period)) if abs(edge) < 2 * width else first
     shifts, cuts, events = [0], [0], []
@@ -223,7 +223,7 @@ def place_by_count(stamps: Stamps, estimate: RateEstimate, rate: float, *, max_g
         shifts.append(shifts[-1] + extra)
         cuts.append(row)
     runs = _counted_runs(stamps, np.array(cuts), np.array(shifts))
-    numbers = np.array([row for row in events], dtype=np.int64).reshape(-1, 5)
+    numbers = np.array(events, dtype=np.int64).reshape(-1, 5)
     if len(numbers):
         numbers[:, 2] = _rows_at(stamps, numbers[:, 2])
     return _placement(start, runs, [numbers], wander)
