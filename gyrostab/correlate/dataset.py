@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -51,23 +52,13 @@ def assemble(
     made: dict[str, Any] = {}
     for driver in found:
         what = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
-        known = product[driver.name] if driver.name in product.data_vars else ("time", driver.values[0], what)
-        made[driver.name] = known
+        made[driver.name] = product[driver.name] if driver.name in product.data_vars else ("time", driver.values[0], what)
     for name, (key, label, units) in _NUMBERS.items():
         made[name] = (dims, table(key), {"long_name": label, "units": units})
     made["windows_used"] = (dims, table("windows", np.int32), {"long_name": "windows used", "units": "1"})
     flags = {"flag_values": np.arange(len(VERDICTS), dtype=np.int8), "flag_meanings": " ".join(VERDICTS)}
     made["coupling_verdict"] = (dims, table("verdict", np.int8), {"long_name": "what the record tells of the coupling", **flags})
-    masks = {name: np.int8(1 << bit) for bit, name in enumerate(LIMITS)}
-    bits = np.zeros(shape, np.int8)
-    for place, entry in entries.items():
-        bits[place] = sum(int(masks[name]) for name in entry["limits"])
-    limits = {
-        "long_name": "what limits the verdict",
-        "flag_masks": np.array(list(masks.values()), np.int8),
-        "flag_meanings": " ".join(masks),
-    }
-    made["coupling_limits"] = (dims, bits, limits)
+    made["coupling_limits"] = (dims, *_limit_flags(shape, entries))
     for v, name in enumerate(names):
         for d, driver in enumerate(found):
             units = slope_units(str(product[name].attrs.get("units", "1")), driver.units)
@@ -82,6 +73,16 @@ def assemble(
     result.attrs = {name: product.attrs[name] for name in kept_attrs if name in product.attrs}
     result.attrs |= {"title": "Coupling of a gyro's noise coefficients and window means with a channel", "interval_level": level}
     return result.assign_attrs(longest_lag_s=longest)
+
+
+def _limit_flags(shape: tuple[int, ...], entries: Mapping[tuple[int, int, int], Mapping[str, Any]]) -> tuple[Any, dict[str, Any]]:
+    """One bit for each thing that limits a verdict, and the attributes that say which."""
+    masks = {name: np.int8(1 << bit) for bit, name in enumerate(LIMITS)}
+    bits = np.zeros(shape, np.int8)
+    for place, entry in entries.items():
+        bits[place] = sum(int(masks[name]) for name in entry["limits"])
+    meanings = {"flag_masks": np.array(list(masks.values()), np.int8), "flag_meanings": " ".join(masks)}
+    return bits, {"long_name": "what limits the verdict", **meanings}
 
 
 def _said(key: str, level: float) -> str:
