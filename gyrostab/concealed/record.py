@@ -16,7 +16,7 @@ from gyrostab.concealed.world import AXES, QUICK, Effect, World, stream, to_samp
 from gyrostab.schema import GAP_CAUSES, check_log
 from gyrostab.timegrid import grid_times, time_coordinate
 
-__all__ = ["base_noise", "channels_of", "gap_columns", "make_log", "signal"]
+__all__ = ["base_noise", "channels_of", "gap_columns", "lost", "make_log", "signal", "with_channels"]
 
 Array = NDArray[np.float64]
 
@@ -142,13 +142,15 @@ def make_log(record: Array, channels: dict[str, tuple[Array, float]], *, start: 
         coords=time_coordinate(start, rate, record.shape[1]),
         attrs={"sampling_rate_hz": float(rate), "kind": "rate"},
     ).assign_coords(axis=list(AXES[: record.shape[0]]))
+    return with_channels(log, channels, start=start, rate=rate)
+
+
+def with_channels(log: xr.Dataset, channels: dict[str, tuple[Array, float]], *, start: int, rate: float) -> xr.Dataset:
+    """Put channels, as `channels_of` gives them, into a log; each on its own times where it is slower."""
     for name, (values, own) in channels.items():
-        attrs = {"units": UNITS[name]}
-        if own == rate and values.size == record.shape[1]:
-            log[name] = (("time",), values, attrs)
-        else:
-            dim = f"time_{name}"
+        dim = "time" if own == rate and values.size == log.sizes["time"] else f"time_{name}"
+        if dim != "time":
             log = log.assign_coords(time_coordinate(start, own, values.size, name=dim))
-            log[name] = ((dim,), values, attrs)
+        log[name] = ((dim,), values, {"units": UNITS[name]})
     check_log(log)
     return log

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from gyrostab.concealed.case import truth_of
 from gyrostab.concealed.catalogue import CATALOGUE
 from gyrostab.concealed.naive import allan_variance, octaves
-from gyrostab.concealed.record import UNITS, channels_of, gap_columns
+from gyrostab.concealed.record import channels_of, gap_columns, with_channels
 from gyrostab.concealed.world import Effect, World, draw_world, to_samples
 from gyrostab.errors import OptionError
 from gyrostab.schema import check_log, signal_name
-from gyrostab.timegrid import first_stamp, time_coordinate
+from gyrostab.timegrid import first_stamp
 
 __all__ = ["rough_noise", "salt"]
 
@@ -157,11 +157,4 @@ def _with(log: xr.Dataset, record: Array, channels: dict[str, tuple[Array, float
     gone = np.asarray(np.isnan(record).all(axis=0))
     out = log.isel(axis=slice(0, record.shape[0])).drop_dims("gap", errors="ignore")
     out = out.assign(rate=(("axis", "time"), record, dict(log["rate"].attrs)), **gap_columns(gone, start=world.start, rate=world.rate))
-    for name, (values, rate) in channels.items():
-        if rate == world.rate and values.size == world.size:
-            out[name] = (("time",), values, {"units": UNITS[name]})
-        else:
-            out = out.assign_coords(time_coordinate(world.start, rate, values.size, name=f"time_{name}"))
-            out[name] = ((f"time_{name}",), values, {"units": UNITS[name]})
-    check_log(out)
-    return out
+    return with_channels(out, channels, start=world.start, rate=world.rate)
