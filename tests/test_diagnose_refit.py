@@ -107,6 +107,21 @@ def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
             assert fitted.parameters[name].low < truth < fitted.parameters[name].high
 
 
+@pytest.mark.parametrize("column", ["sensitivity", "quartic"])
+@pytest.mark.parametrize("levels", [(5.0, 5.0), (3.0, 8.0)])
+def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_from_it(quiet, levels, column):
+    reduced, baseline = quiet
+    place = np.linspace(0.0, 1.0, reduced.sizes["block"])
+    g = np.where((place > 0.2) & (place < 0.4), levels[0], np.where((place > 0.6) & (place < 0.8), levels[1], 0.0))
+    drawn = next(iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1)))
+    one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + xr.DataArray(0.005 * g**2, dims="block"))
+    one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
+    (fitted,) = fit_claims(claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline)
+    alike = levels[0] == levels[1]
+    assert set(fitted.parameters) == ({"sensitivity"} if alike else {column})
+    assert ("does not tell" in fitted.say()) is alike
+
+
 @pytest.fixture(scope="module")
 def shaken():
     reduced = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])

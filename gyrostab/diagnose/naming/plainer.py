@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ _NEEDED, _FORM = 6.0, 0.01  # nats that a second term must bring, and of the fir
 def plainer(part: Part, state: State) -> tuple[Part, str]:
     """The part with one of its terms, where that does as well as all, and a sentence about it; else the part as it is.
 
+    A part of one term gets the first of those that the data do not tell from it.
     Terms that rise and fall together, as g^2 and g^4 at one level of vibration, have sizes that are large, opposite and wrong.
 
     Parameters
@@ -29,8 +31,10 @@ def plainer(part: Part, state: State) -> tuple[Part, str]:
     state : State
         With all else that is named.
     """
-    if part.candidate.view not in ("mean", "power") or len(part.variant.columns) < 2:
+    if part.candidate.view not in ("mean", "power"):
         return part, ""
+    if len(part.variant.columns) == 1:
+        return _first_alike(part, state)
     mean, covariance = part_mixture(part, state).moments()
     error = np.sqrt(np.diagonal(covariance))
     alike = float(np.abs(np.tril(covariance / np.outer(error, error), -1)).max())
@@ -47,8 +51,31 @@ def plainer(part: Part, state: State) -> tuple[Part, str]:
     whole = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
     if alike < _ALIKE and whole - gains[name] > _NEEDED + _FORM * gains[name]:
         return part, ""
-    others = " and ".join(other for other in part.variant.columns if other != name)
-    return replace(part, variant=alone[name]), f"The record does not tell its {name} from its {others}, which is taken as 0."
+    others = [other for other in part.variant.columns if other != name]
+    return replace(part, variant=alone[name]), _untold(name, others)
+
+
+def _first_alike(part: Part, state: State) -> tuple[Part, str]:
+    """A part of one term: by the first of the terms that are one with it to the data, whichever rounding had put ahead."""
+    names = dict.fromkeys(one.columns[0] for one in part.candidate.variants if len(one.columns) == 1)
+    terms = [one for name in names if (one := _only(part, name)) is not None]
+    alike = [one for one in terms if one.columns == part.variant.columns or _one_term(part, state, one)]
+    if len(alike) < 2:
+        return part, ""
+    first, *others = alike
+    return replace(part, variant=first), _untold(first.columns[0], [one.columns[0] for one in others])
+
+
+def _one_term(part: Part, state: State, other: Variant) -> bool:
+    """Whether the errors of a part's term and of another one are so much one that the data do not tell the two apart."""
+    both = replace(other, columns=(*other.columns, *part.variant.columns), design=np.concatenate([other.design, part.variant.design]))
+    _, covariance = part_mixture(part, state, both).moments()
+    return bool(abs(covariance[0, 1]) >= _ALIKE * np.sqrt(covariance[0, 0] * covariance[1, 1]))
+
+
+def _untold(name: str, others: Sequence[str]) -> str:
+    taken = "is" if len(others) == 1 else "are"
+    return f"The record does not tell its {name} from its {' and '.join(others)}, which {taken} taken as 0."
 
 
 def _only(part: Part, name: str) -> Variant | None:
