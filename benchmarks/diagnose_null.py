@@ -1,11 +1,11 @@
 """False alarms of the diagnosis on records that hold nothing but noise, simulated sample by sample.
 
-    python benchmarks/diagnose_null.py --records 300 --output docs/method.md
+    python benchmarks/diagnose_null.py --records 300
     python benchmarks/diagnose_null.py --records 300 --whole
 
 Every record is reduced and calibrated by itself, and its largest held-out gain over steps, trends, events, curves, bands and filters is
 ranked among null records drawn from its own calibration. The ranks must be uniform: a share of 1 % below 1 %. With --whole the
-diagnosis itself runs, and what it claims is counted. Prints a Markdown table, and puts it into its place in a page.
+diagnosis itself runs, and what it claims is counted. Prints a Markdown table.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from page import machine, renew
+from page import machine
 from scipy.stats import binom, kstest
 
 from gyrostab.diagnose.calibration.baseline import calibrate
@@ -38,7 +37,6 @@ def main() -> None:
     parser.add_argument("--rates", type=float, nargs="+", default=[10.0, 100.0])
     parser.add_argument("--lost", type=float, nargs="+", default=[0.0, 0.3], help="share of the samples that is missing")
     parser.add_argument("--whole", action="store_true", help="run the whole diagnosis (slow) in place of the gains")
-    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
     options = parser.parse_args()
     kinds = [(rate, lost) for rate in options.rates for lost in options.lost]
     rows = [row for rate, lost in kinds for row in (whole if options.whole else ranks)(rate, lost, options)]
@@ -49,10 +47,7 @@ def main() -> None:
     else:
         head = "| rate [Hz] | lost | in | noise | p < 0.01 | p < 0.05 | p < 0.1 | uniform (Kolmogorov-Smirnov) | gain at 99 %: null, raw |"
     said = f"{machine()}; {options.records} records of 1 h, one axis, N = 0.003, B = 0.004, K = 0.02; {options.nulls} null records each."
-    text = "\n".join([f"{said}\n", head, "|" + "---|" * head.count(" | ") + "---|", *rows])
-    print(text)
-    if options.output:
-        renew(options.output, "false alarms", text)
+    print(f"{said}\n", head, "|" + "---|" * head.count(" | ") + "---|", *rows, sep="\n")
 
 
 def logs(rate: float, lost: float, count: int) -> Iterator[xr.Dataset]:
@@ -119,9 +114,9 @@ def whole(rate: float, lost: float, options: argparse.Namespace) -> list[str]:
 
     named, found, begin = 0, 0, time.monotonic()
     for seed, log in enumerate(logs(rate, lost, options.records)):
-        told = gyrostab.diagnose(log, nulls=options.nulls, seed=seed).to_json()
-        named += bool(told["effects"])
-        found += told["verdict"] != "no mismatch"
+        told = gyrostab.diagnose(log, nulls=options.nulls, seed=seed)
+        named += bool(told.effects)
+        found += told.verdict != "no mismatch"
     levels = np.linspace(0.0, 1.0, 10_001)
     bound = float(levels[binom.cdf(named, options.records, levels) >= 0.05].max())
     seconds = (time.monotonic() - begin) / options.records

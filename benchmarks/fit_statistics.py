@@ -1,16 +1,21 @@
-"""Check every statistical claim of the fit by simulation and print the table of docs/statistics.md.
+"""Check every statistical claim of the fit by simulation, for the table of docs/statistics.md.
 
-    python -m benchmarks.fit_statistics > docs/statistics-table.md      # about five minutes
+    python benchmarks/fit_statistics.py --output docs/statistics.md      # about five minutes
 
 Each row is 1000 independent windows of 40 s at 100 Hz, simulated outside the package (tests/noise_records.py).
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import xarray as xr
+from page import renew
 
 from gyrostab import confidence_interval, davar, fit_noise, make_log
 from gyrostab.noise import TERMS, model_avar
@@ -71,12 +76,17 @@ def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: 
 
 
 def main() -> None:
-    print("| noise | missing | 95 % intervals of the cells | Q | N | B | K | R |\n|---|---|---|---|---|---|---|---|")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
+    options = parser.parse_args()
+    lines = ["| noise | missing | 95 % intervals of the cells | Q | N | B | K | R |", "|---|---|---|---|---|---|---|---|"]
     for number, (name, truth) in enumerate(MIXTURES.items()):
         for gap, (share, block) in GAPS.items():
             rng = np.random.default_rng([2026, number, int(block)])
-            print(f"| {name} | {gap} | {row(rng, truth, share, block)} |", flush=True)
-            print(name, gap, file=sys.stderr)
+            lines.append(f"| {name} | {gap} | {row(rng, truth, share, block)} |")
+            print(lines[-1], flush=True)
+    if options.output:
+        renew(options.output, "table", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -1,17 +1,19 @@
 """How often the 95 % intervals of a diagnosis hold the truth: fits of many records whose statistics are drawn from their laws.
 
-    python benchmarks/intervals.py [RECORDS]
+    python benchmarks/intervals.py --output docs/diagnosis.md
 
 Every record is an hour of a good gyro, three axes at 10 Hz: its block statistics are those of noise, to which an effect is added; the fit
 knows the effect, not its size, and has the noise free. "Wrong" forms are those that a fit cannot reproduce.
 """
 
+import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from page import renew
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -75,12 +77,23 @@ def cases(reduced):
             yield "temperature_bias", "mean", "sensitivity", level, form, size / np.ptp(heat), shifted(shape)
 
 
-if __name__ == "__main__":
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 250
-    reduced = record([])
+def main():
+    """Fit, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--records", type=int, default=200)
+    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
+    options = parser.parse_args()
+    count, reduced = options.records, record([])
     baseline = calibrate(reduced)
     drawn = next(iter(null_records(reduced, baseline, count=count, rng=np.random.default_rng(8), chunk=count)))
-    print(f"| effect | signal | form | inside 95 %, of {count} | bias | scatter |\n| --- | --- | --- | --- | --- | --- |")
+    lines = [f"| effect | signal | form | inside 95 %, of {count} | bias | scatter |", "| --- | --- | --- | --- | --- | --- |"]
     for effect, view, column, level, form, truth, change in cases(reduced):
         share, bias, scatter = held(reduced, baseline, drawn, effect, view, column, truth, change)
-        print(f"| {effect} | {level} | {form} | {share:.1%} | {bias:+.1%} | {scatter:.1%} |", flush=True)
+        lines.append(f"| {effect} | {level} | {form} | {share:.1%} | {bias:+.1%} | {scatter:.1%} |")
+        print(lines[-1], flush=True)
+    if options.output:
+        renew(options.output, "intervals", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
