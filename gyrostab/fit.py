@@ -148,7 +148,8 @@ def _within(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.
     high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max")
     chosen = np.flatnonzero((tau >= low * (1 - 1e-9)) & (tau <= high * (1 + 1e-9)))
     if chosen.size == 0:
-        raise OptionError(f"no averaging time of the surface lies between {low:g} s and {high:g} s; it has {tau[0]:g} s to {tau[-1]:g} s")
+        has = f"it has {tau[0]:g} s to {tau[-1]:g} s; change --fit-from or --fit-to"
+        raise OptionError(f"no averaging time of the surface lies between {low:g} s and {high:g} s; {has}")
     return chosen
 
 

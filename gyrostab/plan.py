@@ -78,7 +78,8 @@ def _pick(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
     known = [str(name) for name in signal["axis"].values]
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
-        raise OptionError(f"axis {unknown or wanted} is not in the log; it has {known}")
+        said = ", ".join(map(repr, unknown)) or "''"
+        raise OptionError(f"axis {said} is not in the log; give one that it has: {', '.join(known)}")
     return signal.sel(axis=wanted)
 
 

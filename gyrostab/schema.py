@@ -114,7 +114,8 @@ def signal_name(log: xr.Dataset) -> str:
     """
     found = [name for name in SIGNAL_UNITS if name in log.data_vars]
     if len(found) != 1:
-        raise SchemaError(f"a log holds either 'rate' or 'angle'; this dataset holds {found or sorted(map(str, log.data_vars))}")
+        holds = ", ".join(found or sorted(map(str, log.data_vars))) or "nothing"
+        raise SchemaError(f"a log holds either 'rate' or 'angle'; this dataset holds {holds}; make one with gyrostab.make_log")
     return found[0]
 
 

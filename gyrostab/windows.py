@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 
-__all__ = ["averaging_factors", "duration_seconds", "samples", "thin"]
+__all__ = ["TAUS", "averaging_factors", "duration_seconds", "samples", "thin"]
 
+#: What averaging times may be, for messages.
+TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
 _SAMPLES = re.compile(r"^\s*(\d+)\s*samples?\s*$")
 
 
@@ -64,7 +66,7 @@ def samples(value: Any, rate: float, option: str) -> int:
     seconds = duration_seconds(value, option, example="10min, 30s or 2000samples")
     count = round(seconds * rate)
     if count < 1:
-        raise OptionError(f"{option} {value!r} is shorter than one sample at {rate:g} Hz ({1 / rate:g} s)")
+        raise OptionError(f"{option} {value!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more")
     return count
 
 
@@ -117,9 +119,9 @@ def averaging_factors(taus: Any, *, rate: float, window: int, tau_max: Any = Non
         return np.unique(np.round(np.geomspace(1, limit, int(taus))).astype(np.int64)) if limit > 1 else np.array([1], dtype=np.int64)
     ks = []
     for tau in taus:
-        k = round(duration_seconds(tau, "tau") * rate)
+        k = round(duration_seconds(tau, "tau", example=TAUS) * rate)
         if k < 1:
-            raise OptionError(f"tau {tau!r} is shorter than one sample at {rate:g} Hz ({1 / rate:g} s)")
+            raise OptionError(f"tau {tau!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more")
         if k > longest:
             raise OptionError(
                 f"tau {tau!r} is longer than half of the window ({longest / rate:g} s), so no second difference fits; "
@@ -127,7 +129,7 @@ def averaging_factors(taus: Any, *, rate: float, window: int, tau_max: Any = Non
             )
         ks.append(k)
     if not ks:
-        raise OptionError("no averaging time is given; use for instance --taus 40, octave, all or 0.1s,1s,10s")
+        raise OptionError(f"no averaging time is given; write for instance {TAUS}")
     return np.unique(np.asarray(ks, dtype=np.int64))
 
 

@@ -49,8 +49,9 @@ def test_davar_takes_any_log_and_no_product(log, product, tmp_path, capfd):
     assert call("davar", log, "-o", tmp_path / "davar.nc", *WINDOW) == 0
     np.testing.assert_array_equal(open_surface(tmp_path / "davar.nc")["avar"], open_product(product)["avar"])
     capfd.readouterr()
-    assert call("davar", product, "-o", tmp_path / "again.nc", *WINDOW) == 2
-    assert "Traceback" not in capfd.readouterr().err
+    for none, what in ((product, "a product"), (tmp_path / "davar.nc", "a dynamic Allan variance")):
+        assert call("davar", none, "-o", tmp_path / "again.nc", *WINDOW) == 2
+        assert f"{none.name}: is {what} that gyrostab wrote, and no log; give the log" in capfd.readouterr().err
 
 
 def test_the_fit_can_start_at_a_longer_averaging_time(log, tmp_path):

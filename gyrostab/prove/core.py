@@ -155,7 +155,7 @@ def _drawn(folder: Path, plans: dict[str, dict[str, Any]], workers: int, stage: 
     if kept is not None:
         return kept
     if real is None and any("copy" in plan for plan in plans.values()):
-        raise ResumeError(f"{folder}: was begun with real recordings, which are not drawn yet; say again where they are")
+        raise ResumeError(f"{folder}: was begun with real recordings, which are not drawn yet; say again where they are with --real DIR")
     jobs = [(folder, name, plan, real) for name, plan in plans.items()]
     found = each_in_processes(draw_case, jobs, workers=workers, told=_counter(stage, "drawing", len(jobs)))
     sums = dict(zip(plans, found, strict=True))

@@ -138,7 +138,7 @@ class Intake:
         """
         name, rows = self.plan.path.name, self.buffers.rows
         if rows == 0:
-            raise FormatError(f"{name}: there is a header but no data row below it; nothing can be read")
+            raise FormatError(f"{name}: there is a header but no data row below it; copy it again, or look at what the logger wrote")
         if self.bad_rows > MAX_UNREADABLE * rows:
             share, first = self.bad_rows / rows, self.bad_places[0]
             what = "the separator, the columns that --map names and the units of time"

@@ -83,12 +83,12 @@ def find_layout(path: Path, head: bytes, *, complete: bool) -> Layout:
     lines, notes = _decode(path, head, complete=complete)
     content = [index for index, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
     if not content:
-        raise FormatError(f"{path.name}: there is no row of data, only {len(lines)} blank or comment lines; nothing can be read")
+        raise FormatError(f"{path.name}: there is no row of data, only {len(lines)} blank or comment lines; copy it again")
     header, separator, above, first = _find_header(path, lines, content)
     offset = sum(len(line) for line in head.splitlines(keepends=True)[:first])
     data = [lines[index] for index in content if index >= first]
     if not data:
-        raise FormatError(f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; nothing can be read")
+        raise FormatError(f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; copy it again")
     rows = [tuple(split_line(re.split("[#%]", line)[0], separator)) for line in data[:HEAD_LINES]]
     width = max((len(row) for row in rows), key=[len(row) for row in rows].count)
     headers = list(header) if header is not None else [str(column) for column in range(width)]
@@ -166,7 +166,8 @@ def _find_header(path: Path, lines: list[str], content: list[int]) -> tuple[list
         widths = {len(row) for mark, row in solid or rows if mark == separator}
         if not following or len(names) in widths or (separator != BLANK and len(names) + 1 in widths):
             return names, separator, index, index + 1
-    raise FormatError(f"{path.name}: no header row or row of numbers in the first {len(lines)} lines; is this a gyro log?")
+    what = f"no header row or row of numbers in the first {len(lines)} lines"
+    raise FormatError(f"{path.name}: {what}; if this is a gyro log, put # before the lines above its header row, or delete them")
 
 
 def _commented_header(lines: list[str], first: int, separator: str, width: int) -> list[str] | None:

@@ -30,6 +30,7 @@ __all__ = ["matches", "read", "scan"]
 
 MAX_COLUMNS = 64
 CHECKED_BLOCKS = 33
+_NO_LOGS = {"surface": "a dynamic Allan variance", "product": "a product"}
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,11 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
 
 def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     """The file as a regular log, of gyrostab or with a stamp for each sample, or None when it is something else."""
-    if _is_own(path):
+    content = _content(path)
+    if content == "log":
         return _open_own(path, options)
+    if content in _NO_LOGS and not options.channels_only:
+        raise FormatError(f"{path.name}: is {_NO_LOGS[content]} that gyrostab wrote, and no log; give the log that it was made of")
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     extra: Any = {"consolidated": False} if path.is_dir() else {}
     try:
@@ -113,14 +117,14 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     return _rebuild_time(path, log)
 
 
-def _is_own(path: Path) -> bool:
-    """Whether it says that gyrostab wrote it as a log; what is damaged as a whole says nothing."""
+def _content(path: Path) -> str:
+    """What it says that gyrostab wrote it as: log, surface or product; what is damaged as a whole, or another's, says nothing."""
     try:
         if path.is_dir():
-            return bool(json.loads((path / ".zattrs").read_text()).get("gyrostab_content") == "log")
-        return stored_attribute(path, "gyrostab_content") == "log"
+            return str(json.loads((path / ".zattrs").read_text()).get("gyrostab_content", ""))
+        return stored_attribute(path, "gyrostab_content")
     except (OSError, RuntimeError, ValueError, AttributeError):
-        return False
+        return ""
 
 
 def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
@@ -181,7 +185,7 @@ def _look(path: Path, file: Any, options: ReadOptions) -> tuple[list[_Column], i
     lines = Counter(v.dimensions[0] for v in numeric if v.ndim == 1)
     lines.update(max(v.dimensions, key=lambda d: len(file.dimensions[d])) for v in numeric if v.ndim == 2)
     if not lines:
-        raise FormatError(f"{path.name}: there is no variable of numbers along a dimension; groups are not looked into")
+        raise FormatError(f"{path.name}: there is no variable of numbers along a dimension; groups are not looked into, so put it in none")
     dim = max(lines, key=lambda d: (len(file.dimensions[d]), lines[d]))
     columns: list[_Column] = []
     notes: list[str] = []

@@ -83,7 +83,7 @@ def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau
     Traceback (most recent call last):
     gyrostab.errors.OptionError: window '10' has no unit; write for instance 10min, 30s or 2000samples
     """
-    from gyrostab.windows import averaging_factors, duration_seconds, samples
+    from gyrostab.windows import TAUS, averaging_factors, duration_seconds, samples
 
     fine = 1e6  # Hz; the true rate is not known yet
     length, hop = samples(window, fine, "window"), samples(step, fine, "step") if step else 1
@@ -96,7 +96,7 @@ def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau
     elif taus.strip() not in ("octave", "all"):
         given += taus.split(",")
     for tau in given:
-        if duration_seconds(tau, "tau") > (half or math.inf):
+        if duration_seconds(tau, "tau", example=TAUS) > (half or math.inf):
             raise OptionError(
                 f"tau {tau.strip()} is longer than half of the window of {window}, so no second difference fits; "
                 "give a longer --window or a shorter tau"
