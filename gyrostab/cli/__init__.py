@@ -11,8 +11,8 @@ import sys
 from collections.abc import Sequence
 
 from gyrostab.cli import commands
+from gyrostab.cli.console import complain, explain, plain_notes, read_config, stoppable
 from gyrostab.cli.frame import app
-from gyrostab.console import complain, explain, plain_notes, read_config, stoppable
 
 __all__ = ["app", "main"]
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
-from gyrostab.options import Common
+from gyrostab.cli.options import Common
 
 __all__ = ["Logs", "Output", "Product", "app", "work"]
 

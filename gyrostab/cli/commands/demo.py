@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gyrostab.cli.frame import Output, app, work
-from gyrostab.options import Common
+from gyrostab.cli.options import Common
 
 __all__ = ["demo"]
 

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from gyrostab.cli.frame import app, work
-from gyrostab.options import Common, Reading
+from gyrostab.cli.options import Common, Reading
 
 __all__ = ["diagnose"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 from gyrostab.cli.frame import Logs, Output, app, work
+from gyrostab.cli.options import Common, Reading
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.options import Common, Reading
 
 __all__ = ["ingest", "scan"]
 

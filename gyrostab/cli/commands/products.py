@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from gyrostab.cli.frame import Output, Product, app, work
+from gyrostab.cli.options import ChannelFile, Common
 from gyrostab.errors import OptionError
-from gyrostab.options import ChannelFile, Common
 
 __all__ = ["correlate", "export", "plot", "report"]
 

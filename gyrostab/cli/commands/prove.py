@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from gyrostab.cli.frame import app, work
-from gyrostab.options import Common, Flag
+from gyrostab.cli.options import Common, Flag
 
 __all__ = ["prove"]
 

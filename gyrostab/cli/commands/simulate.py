@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from gyrostab.cli.frame import Output, app, work
-from gyrostab.options import Common, Reading
+from gyrostab.cli.options import Common, Reading
 
 __all__ = ["simulate"]
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from gyrostab.cli.frame import Logs, Output, app, work
-from gyrostab.options import Common, Fitting, Reading, Running, Windows
+from gyrostab.cli.options import Common, Fitting, Reading, Running, Windows
 
 __all__ = ["davar", "fit", "run"]
 

@@ -14,8 +14,8 @@ from typing import Any, TextIO
 
 from cyclopts import CycloptsError
 
+from gyrostab.cli.options import read_toml
 from gyrostab.errors import GyrostabError, OptionError
-from gyrostab.options import read_toml
 
 __all__ = ["complain", "explain", "plain_notes", "read_config", "stoppable"]
 
