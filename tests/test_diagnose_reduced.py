@@ -297,6 +297,7 @@ def test_temperatures_keep_their_course_inside_of_blocks_and_lose_their_noise(ow
         log = log.assign_coords(time_temperature=log.time.values[::every])
     else:
         log["temperature"] = ("time", seen, {"units": "degree_Celsius"})
+    log["supply_voltage"] = ("time", true, {"units": "V"})
     log["temperature_2"] = ("time_temperature_2", true[::900], {"units": "degree_Celsius"})
     log = log.assign_coords(time_temperature_2=log.time.values[::900])
     reduced = reduce_log(log)
@@ -307,6 +308,8 @@ def test_temperatures_keep_their_course_inside_of_blocks_and_lose_their_noise(ow
     raw = 0.1 / np.sqrt(180_000 / every / fine.size) * (1.0 if own else 10.0)
     assert error.std() < 0.6 * raw
     assert "fine_temperature_2" not in reduced  # slower than the parts
+    parts = true.reshape(*fine.shape, -1).mean(axis=2)
+    np.testing.assert_allclose(reduced.fine_supply_voltage.values, parts, atol=0.05)  # a supply as well, but for its corners
 
 
 def test_a_channel_that_falls_silent_is_missing_there():

@@ -288,6 +288,7 @@ VARIANTS = [
     {"name": "telegraph", "step": 0.2, "low": 0.05, "high": 3.0},
     {"name": "shared_source", "N": [0.1, 0.2, -0.1], "bandwidth": 0.5},
     {"name": "supply_bias", "voltage": 0.1, "ripple": 0.2, "frequency": 17.0},
+    {"name": "supply_bias", "voltage": 0.1, "lag": 7.0},
     {"name": "logger_filter", "cutoff": 3.0, "order": 5, "length": 0.7},
     {"name": "spikes", "kind": "outlier", "per_hour": 9000},
     {"name": "held_samples", "per_hour": 3600, "length": 0.8},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -137,3 +138,49 @@ def test_supply_bias_follows_both_channels_and_ripple_folds():
     assert spectrum.max() == pytest.approx(0.4 * abs(np.sinc(63 / 50)), rel=1e-6)
     with pytest.raises(SchemaError, match="'supply_bias' needs the channel 'light_power'"):
         simulate({"effect": [{"name": "supply_bias", "power": 1}], "noise": {}, "log": {"rate": 1, "duration": "9s"}})
+
+
+def slow_supply(lag):
+    return make_effect({"name": "supply_bias", "voltage": 0.02, "power": -0.003, "lag": lag, "reference_power": 0.0, "axes": ["x"]})
+
+
+def test_a_slow_supply_settles_after_a_step_and_trails_a_ramp():
+    """A step D becomes ``D (1 - exp(-t / lag))``, a ramp v t ``v (t - lag (1 - exp(-t / lag)))``."""
+    t = (np.arange(8000) - 1000) / 20.0
+    power = 1e-4 + 2e-8 * np.maximum(t, 0.0)
+    found = run(slow_supply(30.0), size=t.size, rate=20.0, drivers={"supply_voltage": np.where(t > 0, 21.0, 24.0), "light_power": power})
+    settled = -np.expm1(-np.maximum(t, 0.0) / 30.0)
+    ramp = 100.0 + 0.02 * (np.maximum(t, 0.0) - 30.0 * settled)
+    np.testing.assert_allclose(found[0], 0.02 * -3.0 * settled - 0.003 * ramp, atol=0.002 * 0.06)
+
+
+@pytest.mark.parametrize("lag", [3.0, 20.0, 100.0, 2000.0])
+def test_means_of_a_slow_supply_are_those_that_are_said(lag):
+    """Loads that are switched inside of windows of 20 s: parts of the windows tell the settling, their means blur it."""
+    t = np.arange(30_000) / 20.0
+    drivers = {"supply_voltage": 24.0 - 2.0 * ((t > 305.0) & (t < 707.5)), "light_power": 1e-4 * np.exp(-t / 900.0)}
+    found = run(slow_supply(lag), size=t.size, rate=20.0, drivers=drivers)[0].reshape(-1, 400).mean(axis=1)
+    means = {name: values.reshape(-1, 400).mean(axis=1) for name, values in drivers.items()}
+    blunt = windows_of(30_000, 20.0, 20.0, axes=("x",), drivers=means)
+    sharp = replace(blunt, fine={name: values.reshape(75, 8, 50).mean(axis=2) for name, values in drivers.items()})
+    off = []
+    for windows in (blunt, sharp):
+        said = slow_supply(lag).explain(windows).mean
+        off.append(np.abs(0.02 * said["voltage"] - 0.003 * said["power"] - found)[1:].max())
+    assert off[1] < 0.04 * np.ptp(found)
+    assert off[1] < 0.5 * off[0]
+
+
+def test_a_supply_without_lag_is_the_limit_of_short_ones():
+    """With a lag of nothing the means are those of the channel itself, whatever its course is taken for."""
+    means = {"supply_voltage": np.array([24.0, 22.0, 23.0, 23.5])}
+    windows = windows_of(800, 10.0, 20.0, axes=("x",), drivers=means)
+    at_once, soon = (slow_supply(lag).explain(windows).mean["voltage"] for lag in (0.0, 1e-6))
+    np.testing.assert_array_equal(at_once, means["supply_voltage"] - 24.0)
+    line = np.interp(np.arange(0.5, 80.0), windows.centre, means["supply_voltage"]).reshape(4, 20).mean(axis=1) - 24.0
+    np.testing.assert_allclose(soon[1:3], line[1:3], atol=1e-5)
+
+
+def test_a_slow_supply_says_its_lag():
+    said = make_effect({"name": "supply_bias", "voltage": 0.02, "lag": 40.0}).say({"lag": 5.0})
+    assert said == "The bias follows the supply on all axes, by 0.02 deg/h/V of the voltage, with a lag of 40 ± 5 s."

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["mean_changes", "mean_play", "mean_rates", "play", "relax", "slab"]
+__all__ = ["mean_changes", "mean_followed", "mean_play", "mean_rates", "play", "relax", "slab"]
 
 Array = NDArray[np.float64]
 
@@ -149,6 +149,31 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
     at, line = _joined(known, values, begin, end)
     followed = _follow(at, line, time)
     return np.asarray((followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin))
+
+
+def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
+    """Mean over intervals of what follows T with one relaxation time, ``y' = (T - y) / t``, from a few values of T on straight lines.
+
+    Parameters
+    ----------
+    known, values, begin, end, time : ndarray, float
+        As for `mean_changes`.
+
+    Returns
+    -------
+    ndarray, shape (w,)
+        Means of y [unit of T].
+
+    Examples
+    --------
+    >>> mean_followed(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.5).round(4)
+    array([0.905, 2.9  ])
+    """
+    at, line = _joined(known, values, begin, end)
+    followed = _follow(at, line, time)
+    total = np.concatenate([[0.0], np.cumsum((line[1:] + line[:-1]) / 2.0 * np.diff(at))])
+    whole = total - time * followed  # the integral of y is that of T less t times the growth of y
+    return np.asarray((whole[np.searchsorted(at, end)] - whole[np.searchsorted(at, begin)]) / (end - begin))
 
 
 def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:

@@ -20,6 +20,7 @@ __all__ = ["Clipping", "ClockError", "GaussMarkov", "SupplyBias"]
 _HOUR = 3600.0
 _PPM = 1e-6
 _LONGEST = 2**20
+_LAGS = np.array([0.0, 8.0, 25.0, 80.0, 250.0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,12 +29,16 @@ class SupplyBias(Effect):
 
     ``b = k_V (V - V0) + k_P (P - P0) + A sin(2 pi f t)``, averaged over every sample, so ripple above half of the sampling rate folds.
 
+    With a `lag` V and P are what follows the channels with that time constant, ``lag dV/dt = V_channel - V``, in balance at the start: a
+    regulator settles, and parts that the load or the light heats come after their power.
+
     *DAVAR*: a battery that runs down is a slow trend (R), a load that is switched a step (apparent K), ripple a bump at 0.371 / f or at its
-    fold. *Window mean*: follows the channel without lag. *Spectrum*: the line of the ripple. *Axes*: all follow the same channel
-    with factors of their own.
+    fold. *Window mean*: follows the channel at once, or after the lag. *Spectrum*: the line of the ripple. *Axes*: all follow the same
+    channel with factors of their own.
 
     Confused with temperature_bias (temperature moves the voltage, or loads heat), ageing_bias (a battery over days) and spectral_line:
-    regress on voltage and temperature at once; loads that are switched separate them.
+    regress on voltage and temperature at once; loads that are switched separate them. With a lag, the exponential after a switched load
+    is what tells it from a random walk.
 
     References
     ----------
@@ -58,43 +63,76 @@ class SupplyBias(Effect):
     reference_power: float = parameter("uW", "power without bias", default=100.0, low=0.0, high=1e6)
     ripple: float = parameter("deg/h", "amplitude of the ripple", default=0.0, typical=0.05, low=-1e6, high=1e6)
     frequency: float = parameter("Hz", "frequency of the ripple", default=100.0, typical=3.3, low=1e-6, high=1e6)
+    lag: float = parameter("s", "time constant with which the bias follows the channels; 0 for at once", default=0.0, low=0.0, high=1e5)
 
     def needs(self) -> tuple[str, ...]:
         """Only what it is sensitive to."""
         return ("supply_voltage",) * bool(self.voltage) + ("light_power",) * bool(self.power)
 
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """No channel has been seen."""
+        return {}
+
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
         bias = np.zeros(chunk.size)
+        if not chunk.size:
+            return bias, state
+        seen = {name: self._follow(chunk, name, state) for name in self.needs()}
         if self.voltage:
-            bias += self.voltage * (chunk.drivers["supply_voltage"] - self.reference_voltage)
+            bias += self.voltage * (seen["supply_voltage"] - self.reference_voltage)
         if self.power:
-            bias += self.power * (chunk.drivers["light_power"] * 1e6 - self.reference_power)
+            bias += self.power * (seen["light_power"] * 1e6 - self.reference_power)
         if self.ripple:
             cycles = self.frequency / chunk.rate
             middle = (np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5) * cycles
             bias += self.ripple * turn_means(middle, np.full(1, cycles), -math.pi / 2.0)
         return bias, state
 
+    def _follow(self, chunk: Chunk, name: str, state: dict[str, Any]) -> Array:
+        """A channel, straight between its samples, as the bias follows it; where it stands goes into the state."""
+        from gyrostab.kernels.thermal import relax
+
+        values = chunk.drivers[name]
+        if not self.lag:
+            return values
+        before = state.get(name, (float(values[0]), np.zeros(1)))
+        speed, state[name] = relax(values, chunk.rate, np.array([self.lag]), np.ones((1, 1)), before)
+        return np.asarray(values - self.lag * speed[0])
+
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """The frequency of the ripple, band by band."""
-        return {"frequency": windows.frequency}
+        """The frequency of the ripple, band by band; lags from at once to minutes."""
+        return {"frequency": windows.frequency, "lag": _LAGS}
+
+    def points(self, windows: Windows) -> list[Mapping[str, float]]:
+        """Lags of what follows channels, frequencies of what does not."""
+        lags: list[Mapping[str, float]] = [{"frequency": self.frequency, "lag": float(lag)} for lag in _LAGS]
+        return lags + [{"frequency": float(frequency), "lag": 0.0} for frequency in windows.frequency]
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means: the channels that there are; the line of the ripple."""
         mean = {}
         if "supply_voltage" in windows.drivers:
-            mean["voltage"] = windows.drivers["supply_voltage"] - self.reference_voltage
+            mean["voltage"] = self._followed(windows, "supply_voltage") - self.reference_voltage
         if "light_power" in windows.drivers:
-            mean["power"] = windows.drivers["light_power"] * 1e6 - self.reference_power
+            mean["power"] = self._followed(windows, "light_power") * 1e6 - self.reference_power
         place = np.full(windows.begin.size, float(fold(self.frequency, windows.rate)))
         power = 0.5 * np.sinc(self.frequency / windows.rate) ** 2
         return Prediction(mean=mean, spectrum={"ripple": line_density(windows, place, power)}, coherent=True, line=place)
+
+    def _followed(self, windows: Windows, name: str) -> Array:
+        """Window means of a channel as the bias follows it."""
+        from gyrostab.kernels.thermal import mean_followed
+
+        if not self.lag:
+            return windows.drivers[name]
+        return mean_followed(*windows.course(name), windows.begin, windows.end, self.lag)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
         parts = [f"by {self.quantity('voltage', errors)} of the voltage"] if self.voltage else []
         parts += [f"by {self.quantity('power', errors)} of light"] if self.power else []
+        parts += [f"with a lag of {self.quantity('lag', errors)}"] if self.lag and parts else []
         parts += [f"with a ripple of {self.quantity('ripple', errors)} at {self.quantity('frequency', errors)}"] if self.ripple else []
         return f"The bias follows the supply {self.on_axes()}, {', '.join(parts) or 'by nothing'}."
 

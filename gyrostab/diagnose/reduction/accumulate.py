@@ -17,13 +17,13 @@ from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.timegrid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
-__all__ = ["FINE", "HARMONICS", "PARTS", "PHASES", "Accumulator"]
+__all__ = ["FINE", "FOLLOWED", "HARMONICS", "PARTS", "PHASES", "Accumulator"]
 
 Array = NDArray[np.float64]
 #: Parts of the record with a line spectrum each; harmonics of the rotation; bins of the ramp's phase.
 PARTS, HARMONICS, PHASES = 8, (1, 2, 3), 40
-#: Parts of a block over which temperatures are averaged.
-FINE = 4
+#: Parts of a block over which channels are averaged, and the beginnings of the names of those that effects follow with a lag.
+FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
 _GAP_S = 1.0  # shorter gaps are not listed
 _FOR_LATTICE = 64  # blocks whose values are kept
@@ -60,7 +60,7 @@ class Accumulator:
         self.line_sum = np.zeros((self.axes, PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, PARTS, 2))
-        self.fine = {name: np.full((blocks, FINE), np.nan) for name in self.beside if name.startswith("temperature")}
+        self.fine = {name: np.full((blocks, FINE), np.nan) for name in self.beside if name.startswith(FOLLOWED)}
         self.kept: list[Array] = []
         self.gaps: list[tuple[int, int]] = []
         self.open: int | None = None

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.reduction.accumulate import FINE, HARMONICS, PARTS, PHASES, Accumulator
+from gyrostab.diagnose.reduction.accumulate import FINE, FOLLOWED, HARMONICS, PARTS, PHASES, Accumulator
 from gyrostab.diagnose.reduction.outliers import count_outliers, lattice_step
 from gyrostab.diagnose.reduction.stretches import channel_means, numeric_channels, read_stretches, row_count, sample_count
 from gyrostab.errors import OptionError
@@ -23,7 +23,7 @@ __all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "reduce_
 
 Array = NDArray[np.float64]
 _BLOCK_S, _FEWEST, _MOST, _LEAST_SAMPLES, _MUST = 20.0, 90, 6000, 100, 24
-_SMOOTH = 2.0  # blocks over which the course of a temperature is smoothed at most
+_SMOOTH = 2.0  # blocks over which the course of a channel is smoothed at most
 _MEAN_SHARE = 0.1  # of a block that must be present for its mean
 _POWER = "degree2 hour-2 Hz-1"
 _RATE = INNER["rate"]
@@ -109,7 +109,7 @@ def reduce_log(
         ``repeats``, ``extremes``, ``zeros``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of
         its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band), ``witness_power``, ``witness_cross``,
         ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``, ``profile(axis, block, phase)``,
-        ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of temperatures, and the gaps and restarts in
+        ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects follow late, and gaps and restarts in
         seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
@@ -258,11 +258,11 @@ def _channels(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
 
 
 def _fine(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
-    """Temperatures in parts of the blocks, less their noise, where each part has a value of its own: effects follow their changes."""
+    """Channels in parts of the blocks, less their noise, where each part has a value of its own: effects follow them with a lag."""
     found: dict[str, Any] = {}
     edges = grid_times(work.start, work.rate, np.arange(work.blocks * FINE + 1) * work.length // FINE)
     for name in numeric_channels(log)[1]:
-        if not name.startswith("temperature"):
+        if not name.startswith(FOLLOWED):
             continue
         span = np.ptp(log[f"time_{name}"].values.astype("datetime64[ns]").astype(np.int64)) / 1e9
         if log.sizes[f"time_{name}"] * work.length >= span * work.rate * FINE > 0.0:
