@@ -126,7 +126,8 @@ class SupplyBias(Effect):
 
         if not self.lag:
             return windows.drivers[name]
-        return mean_followed(*windows.course(name), windows.begin, windows.end, self.lag)
+        at, values = windows.course(name)
+        return mean_followed(at, values, windows.begin, windows.end, self.lag)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
