@@ -146,17 +146,20 @@ def test_factors_of_means_are_those_of_dense_marginal_likelihoods(tier, given_co
     assert difference == pytest.approx(none[1] - none[0], abs=1e-6)
 
 
-@pytest.mark.parametrize("tier", ["free", "calibrated"])
+@pytest.mark.parametrize("tier", ["free", "calibrated", "known"])
 def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(tier):
     n, bands = 14, 4
     data, baseline = power_case(n, bands, records=2)
+    if tier == "known":  # a model without quantization and flicker
+        tier = "free"
+        baseline = baseline.assign(square=baseline["square"] * [0.0, 1.0, 0.0, 1.0], square_stderr=0.0 * baseline["square_stderr"])
     rng = np.random.default_rng(8)
     designs = [np.repeat(np.arange(n)[:, None] / n, bands, axis=1), rng.standard_normal((n, bands, 2))]
     factors = power_factors(data, baseline, designs, axis="x", tier=tier)
     level, precision = noise_columns(baseline, axis="x", tier=tier)
     weight = data["shape"].values[0].ravel()
     cells = np.isfinite(weight)
-    Z = level.reshape(-1, 4)
+    Z = level.reshape(-1, precision.shape[0])
     shared = np.kron(np.diag(baseline["common"].values[0]), np.ones((bands, bands)))
     W = np.linalg.inv(np.diag(1.0 / weight[cells]) + shared[np.ix_(cells, cells)])
     middle = W - W @ Z[cells] @ np.linalg.solve(Z[cells].T @ W @ Z[cells] + precision, Z[cells].T @ W)

@@ -147,7 +147,7 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
     Returns
     -------
     columns : ndarray, shape (block, band, term)
-        Per unit of the squared coefficient [1 / unit].
+        Per unit of the squared coefficient [1 / unit], of the terms that may change: one that is exactly known stays.
     precision : ndarray, shape (term, term)
         Of the change of the squared coefficient.
     """
@@ -159,7 +159,8 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
         names = [str(name) for name in baseline["noise"].values]
         freedom = np.array([{"Q": 1.0, "N": 1e3, "B": 3.0, "K": 3.0}[name] for name in names])
         error = freedom * np.hypot(square, error)
-    return columns, np.diag(1.0 / np.square(error))
+    free = error > 0.0
+    return columns[..., free], np.diag(1.0 / np.square(error[free]))
 
 
 class Cells(NamedTuple):
