@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.gains.lines import expected_lines
 from gyrostab.diagnose.views.cells import Array, Windows, cube_root_score, over_windows, values_of, view_dataset
 
 __all__ = ["score"]
@@ -32,7 +33,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     power, weight = values_of(reduced, "line_power", "axis", "part", "line"), values_of(reduced, "line_weight", "axis", "part")
     frequency = reduced["line_frequency"].values
     windows = _parts(reduced)
-    flat = power / _expected(baseline, frequency)[:, None, :]
+    expected = expected_lines(baseline, frequency)[:, None, :]
+    flat = power / expected
     there = np.isfinite(flat) & (weight > 0)[..., None]
     each = np.where(there, weight[..., None], 0.0)
     flat = np.where(there, flat, 0.0) * each
@@ -44,7 +46,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         around = _surroundings(flat)
         ratio = flat / around
     # a sum over lines, which only a recording needs
-    excess = _near(flat - around) * _expected(baseline, frequency)[:, None, :] if flat.ndim == 3 else np.zeros(1)
+    excess = _near(flat - around) * expected if flat.ndim == 3 else np.zeros(1)
     z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND)))
     half = 0.371 / frequency  # where the Allan variance of a sine is largest
     return view_dataset(
@@ -63,7 +65,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 def _parts(reduced: xr.Dataset) -> Windows:
     """Blocks of the equal parts of the record, and of the whole last."""
     parts, blocks = reduced.sizes["part"], reduced.sizes["block"]
-    edge = np.rint(np.linspace(0, blocks, parts + 1)).astype(np.int64)
+    edge = -(-np.arange(parts + 1) * blocks // parts)  # as the blocks were shared out when the log was read
     return Windows(np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), blocks))
 
 
@@ -81,13 +83,6 @@ def _evenness(reduced: xr.Dataset, windows: Windows) -> Array:
     share = np.clip((lines - bands[place - 1]) / (bands[place] - bands[place - 1]), 0.0, 1.0)
     even = np.minimum(even, 1.0)
     return np.asarray(even[..., place - 1] * (1.0 - share) + even[..., place] * share)
-
-
-def _expected(baseline: xr.Dataset, frequency: Array) -> Array:
-    """Mean spectrum of the baseline at the lines, by axis."""
-    spectrum = baseline["spectrum"].mean("block").transpose("axis", "band").values
-    bands = np.log(baseline["frequency"].values)
-    return np.stack([np.exp(np.interp(np.log(frequency), bands, np.log(row))) for row in spectrum])
 
 
 def _near(excess: Array) -> Array:
