@@ -11,6 +11,8 @@ from gyrostab.diagnose.calibration.expected import common_variance, noise_powers
 from gyrostab.diagnose.calibration.quiet import quiet_blocks
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.views.cells import cube_root_score
+from gyrostab.diagnose.views.davar import allan_surface
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.expected import expected_powers
 from gyrostab.kernels.periodogram import band_edges, ordinates, taper
@@ -155,6 +157,26 @@ def test_a_model_is_taken_with_its_effects():
         from_model(reduced.drop_vars("channel_temperature"), model)
     with pytest.raises(OptionError, match="no noise"):
         from_model(reduced, {"noise": {"z": {"N": 1.0}}})
+
+
+def test_a_ramp_of_a_model_is_expected_once():
+    noise = {"N": 0.003, "R": 2.0}
+    reduced = reduce_log(log(noise))
+    surface = allan_surface(reduced, from_model(reduced, {"noise": noise}))
+    score = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])
+    assert np.nanmax(np.abs(score[0, -1])) < 4.0  # the record as one window
+
+
+def test_a_filter_of_a_model_is_seen_through_random_gaps():
+    model = {
+        "noise": {"N": 0.003},
+        "effect": [{"name": "logger_filter", "cutoff": 1.5, "order": 2, "instrument": 1}],
+        "log": {"axes": ["x"]},
+    }
+    reduced = reduce_log(log({"N": 0.003}, effects=model["effect"], lost=0.3))
+    ratio = (reduced["power"] / from_model(reduced, model)["spectrum"]).mean("block")
+    error = 1.0 / np.sqrt(reduced["shape"].sum("block"))
+    assert float(np.abs((ratio - 1.0) / error).max()) < 4.5
 
 
 def test_a_simulation_is_calibrated_and_keeps_its_level():

@@ -14,9 +14,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.calibration.expected import NOISE, common_variance, noise_powers, white_variance
+from gyrostab.diagnose.calibration.expected import NOISE, band_columns, common_variance, noise_powers, white_variance
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
 from gyrostab.diagnose.calibration.quiet import loudness, quiet_blocks, quiet_spans
+from gyrostab.diagnose.effects.candidates import windows_of
+from gyrostab.diagnose.effects.cells import effective
+from gyrostab.diagnose.effects.response import response_of
 from gyrostab.diagnose.gains.products import mean_products
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import HOUR, LAWS, TERMS
@@ -322,12 +325,10 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> tuple[Arr
     square : ndarray, shape (axis, 4)
         Squared noise coefficients.
     """
-    from gyrostab.diagnose.effects.candidates import windows_of
-
     axes = [str(axis) for axis in reduced["axis"].values]
-    columns = noise_powers(reduced)
-    mean, level = np.zeros(columns.shape[:2]), np.repeat(square[:, None], columns.shape[1], axis=1)
-    added, response, left_out = np.zeros(columns.shape[:3]), np.ones((len(axes), 1, columns.shape[2])), []
+    blocks, bands = reduced.sizes["block"], reduced.sizes["band"]
+    mean, level = np.zeros((len(axes), blocks)), np.repeat(square[:, None], blocks, axis=1)
+    added, response, left_out = np.zeros((len(axes), blocks, bands)), np.ones((len(axes), 1, bands)), []
     for effect in model.effects:
         rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
         drivers = drivers_of(effect)
@@ -346,11 +347,12 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> tuple[Arr
         for name, values in seen.spectrum.items():
             added[rows] += _sizes(effect, name, windows.axes)[:, None, None] ** 2 * values
         if seen.response is not None:
-            response[rows] *= seen.response
+            response[rows] *= response_of(effect, reduced)
         elsewhere = seen.marks or seen.wander or seen.transfer or seen.order or seen.phase_locked
         if elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None):
             left_out.append(effect.name)
-    return mean, (np.einsum("abfn,abn->abf", columns, np.maximum(level, 0.0)) + added) * response, left_out
+    density = (np.einsum("fn,abn->abf", band_columns(reduced), np.maximum(level, 0.0)) + added) * response
+    return mean, effective(density, reduced), left_out
 
 
 def drivers_of(effect: Effect) -> dict[str, str]:

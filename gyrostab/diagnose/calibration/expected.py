@@ -8,11 +8,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.effects.cells import effective
 from gyrostab.kernels.expected import expected_powers
 from gyrostab.kernels.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import HOUR, URAD_PER_S
 
-__all__ = ["NOISE", "common_variance", "line_columns", "noise_powers", "white_variance"]
+__all__ = ["NOISE", "band_columns", "common_variance", "line_columns", "noise_powers", "white_variance"]
 
 Array = NDArray[np.float64]
 #: Random terms, in the order of the dimension `noise`.
@@ -31,20 +32,35 @@ def line_columns(reduced: xr.Dataset) -> Array:
     return np.asarray(expected_powers(taper(size), rate, ordinates(size)).T * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR]))
 
 
-def noise_powers(reduced: xr.Dataset) -> Array:
+def band_columns(reduced: xr.Dataset) -> Array:
+    """Expected band powers of a full block for unit squares of Q, N, B, K.
+
+    Returns
+    -------
+    ndarray, shape (band, term)
+        [degree2 hour-2 Hz-1 per squared unit of the noise table].
+    """
+    each = line_columns(reduced)
+    edges = band_edges(int(reduced.attrs["block_samples"])) - 1
+    return np.stack([each[low:high].mean(axis=0) for low, high in pairwise(edges)])
+
+
+def noise_powers(reduced: xr.Dataset, response: Array | None = None) -> Array:
     """Expected band powers for unit squares of Q, N, B, K, as the gaps of each block let them be seen.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+    response : ndarray, shape (band,), optional
+        Factor that a filter has put on the noise before samples were lost.
 
     Returns
     -------
     ndarray, shape (axis, block, band, term)
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
-    each = line_columns(reduced).T
-    edges = band_edges(int(reduced.attrs["block_samples"])) - 1
-    whole = np.stack([each[:, low:high].mean(axis=1) for low, high in pairwise(edges)])
-    near = reduced["neighbours"].transpose("axis", "block").values
-    near = np.where(np.isfinite(near), near, 1.0)[..., None, None]
-    return np.asarray(near * whole + (1.0 - near) * each.mean(axis=1))
+    whole = band_columns(reduced).T * (1.0 if response is None else response)
+    return np.stack([effective(one[None, None], reduced) for one in whole], axis=-1)
 
 
 def common_variance(reduced: xr.Dataset) -> tuple[Array, Array]:

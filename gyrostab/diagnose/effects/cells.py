@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.effects.candidates import Candidate
 from gyrostab.diagnose.gains.gain import Cells, independent, noise_columns
 from gyrostab.diagnose.reduction.reduced import measured
+from gyrostab.kernels.periodogram import taper
 
-__all__ = ["State", "begin_state", "cells_of", "drawn", "effective", "pair_rows", "view_rows"]
+__all__ = ["State", "begin_state", "cells_of", "drawn", "effective", "in_place", "pair_rows", "view_rows"]
 
 Array = NDArray[Any]
 
@@ -72,12 +73,23 @@ def drawn(cells: Cells, rng: np.random.Generator, count: int) -> Cells:
     return cells._replace(values=spread[..., None] * rng.standard_normal((*spread.shape, count)))
 
 
+def in_place(reduced: xr.Dataset) -> Array:
+    """Share of a density that the samples of each block show at its own frequencies, (axis, block): 1 without gaps.
+
+    Random gaps spread the rest over all frequencies. That the tapered ends of a block have fewer neighbours spreads nothing.
+    """
+    near = reduced["neighbours"].transpose("axis", "block").values
+    weights = taper(int(reduced.attrs["block_samples"]))
+    whole = float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())
+    return np.minimum(np.where(np.isfinite(near), near, whole) / whole, 1.0)
+
+
 def effective(density: Array, reduced: xr.Dataset) -> Array:
     """A density, (axis or 1, block or 1, band), as gaps let it be seen: mixed with its mean over frequency, (axis, block, band)."""
-    near = reduced["neighbours"].values[..., None]
+    near = in_place(reduced)[..., None]
     width = reduced["band_high"].values - reduced["band_low"].values
     level = (density * width).sum(axis=-1, keepdims=True) / width.sum()
-    return np.asarray(np.where(np.isfinite(near), near * density + (1.0 - near) * level, density))
+    return np.asarray(near * density + (1.0 - near) * level)
 
 
 def pair_rows(reduced: xr.Dataset) -> list[tuple[str, ...]]:

@@ -9,10 +9,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.calibration.expected import common_variance, noise_powers
+from gyrostab.diagnose.calibration.expected import band_columns, common_variance
 from gyrostab.diagnose.calibration.posterior import Fit, expected_of
 from gyrostab.diagnose.effects.candidates import Candidate
-from gyrostab.diagnose.effects.cells import State
+from gyrostab.diagnose.effects.cells import State, in_place
 from gyrostab.diagnose.effects.explained import Part, explain_away
 from gyrostab.diagnose.effects.response import is_filter, response_of
 from gyrostab.diagnose.effects.search import gains
@@ -59,8 +59,8 @@ def filter_sizes(parts: Sequence[Part], state: State) -> tuple[dict[str, tuple[f
     fits = [_fit(part.row[0], state) for part in parts]
 
     def likelihood(values: Mapping[str, Any]) -> float:
-        response = response_of(kind.example(**values), state.reduced)
-        return sum(_likelihood(fit, response) for fit in fits)
+        filtered = band_columns(state.reduced) * response_of(kind.example(**values), state.reduced)[:, None]
+        return sum(_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
 
     family = [one.values for one in parts[0].candidate.variants if is_filter("power", one)]
     best = max(family, key=likelihood)
@@ -88,8 +88,8 @@ def _zoomed(grid: Sequence[float], start: float, likelihood: Callable[[float], f
     return mean, sd
 
 
-def _fit(axis: str, state: State) -> Fit:
-    """Powers of an axis averaged over the record, with the noise and what else is named free."""
+def _fit(axis: str, state: State) -> tuple[Fit, Array]:
+    """Powers of an axis averaged over the record, with the noise and what else is named free; and how gaps mix the bands of the noise."""
     reduced = state.reduced
     row = state.axes.index(axis)
     power, shape = (reduced[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape"))
@@ -102,13 +102,15 @@ def _fit(axis: str, state: State) -> Fit:
     def mean(values: Array) -> Array:
         return np.asarray((use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total)
 
-    columns = np.stack([mean(noise_powers(reduced)[row][..., term]) for term in range(4)], axis=1)
+    whole = mean(in_place(reduced)[row, :, None])
+    width = (reduced["band_high"] - reduced["band_low"]).values
+    seen = np.diag(whole) + np.outer(1.0 - whole, width / width.sum())
     beside = [mean(one) for one in state.given.get(("power", axis), [])]
     free = np.stack([one / max(np.abs(one).max(), 1e-300) for one in beside], axis=1) if beside else None
-    return Fit(mean(power), columns, total * share, beside=free, start=mean(state.weight[row]))
+    return Fit(mean(power), seen @ band_columns(reduced), total * share, beside=free, start=mean(state.weight[row])), seen
 
 
-def _likelihood(fit: Fit, response: Array) -> float:
-    """Largest log likelihood of the powers with this response, over the noise."""
-    expected = expected_of(fit._replace(columns=fit.columns * response[:, None]))
+def _likelihood(fit: Fit) -> float:
+    """Largest log likelihood of the powers, over the noise."""
+    expected = expected_of(fit)
     return float(-(fit.weight * (np.log(expected) + fit.power / expected)).sum())

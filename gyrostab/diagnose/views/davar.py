@@ -183,11 +183,11 @@ def _padded(values: Array, size: int) -> Array:
 
 
 def _slow(reduced: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
-    """Allan variance of the slow terms by axis [degree2 hour-2]."""
+    """Allan variance of the slow terms by axis [degree2 hour-2]; a ramp is in the known mean."""
     coefficient = values_of(baseline.transpose(..., "axis", "term"), "coefficient", "axis", "term")
     total = np.zeros(reduced.sizes["axis"])
     for place, term in enumerate(baseline["term"].values):
-        if str(term) in ("B", "K", "R"):
+        if str(term) in ("B", "K"):
             total = total + LAWS[str(term)].avar(tau) * np.nan_to_num(coefficient[..., place]) ** 2
     return np.asarray(total)
 
