@@ -16,7 +16,7 @@ from gyrostab.diagnose.gains.lines import line_skirt
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.phase import fold
 
-__all__ = ["Part", "explain_away", "mean_columns", "reweighted", "take_part", "without_turns"]
+__all__ = ["Part", "explain_away", "mean_columns", "odd_blocks", "reweighted", "take_part", "without_turns"]
 
 Array = NDArray[np.float64]
 _LINE_REACH = 3  # lines on each side of one that belong to it
@@ -218,14 +218,10 @@ def _line(state: State, part: Part) -> State:
 
 def _marks(state: State, part: Part) -> State:
     """Blocks with odd samples say nothing of the rest; where there are too many of them, the shape of the spectrum does not."""
-    if part.candidate.effect == "rate_quantization" or part.candidate.effect.startswith("~"):
+    if _everywhere(part):
         return state
-    axis = part.row[0]
-    name = part.variant.columns[0]
-    count = state.reduced[name].sel(axis=axis).values
-    usual = np.median(count)
-    odd = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
-    if odd.mean() > _FEW or not odd.any():
+    axis, odd = part.row[0], odd_blocks(part, state.reduced)
+    if not odd.any():
         return _free_shape(state, axis)
     keep = xr.DataArray(~odd, dims="block")
     here = state.reduced["axis"] == axis
@@ -236,6 +232,19 @@ def _marks(state: State, part: Part) -> State:
         touched = xr.DataArray(np.array([axis in pair for pair in pair_rows(reduced)], dtype=bool), dims="pair")
         reduced["cross"] = reduced["cross"].where(keep | ~touched)
     return replace(state, reduced=reduced)
+
+
+def _everywhere(part: Part) -> bool:
+    """Odd samples that are in every block alike, so that none says less of the rest than others."""
+    return part.candidate.effect == "rate_quantization" or part.candidate.effect.startswith("~")
+
+
+def odd_blocks(part: Part, reduced: xr.Dataset) -> NDArray[np.bool_]:
+    """Blocks with odd samples, which are left out on the axis; none where they would be too many, or the effect is in all alike."""
+    count = reduced[part.variant.columns[0]].sel(axis=part.row[0]).values if not _everywhere(part) else np.zeros(reduced.sizes["block"])
+    usual = np.median(count)
+    odd = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
+    return np.asarray(odd & (odd.mean() <= _FEW))
 
 
 _TAKERS = {

@@ -14,7 +14,7 @@ from gyrostab.diagnose.calibration.expected import common_variance, noise_powers
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior
 from gyrostab.diagnose.effects.candidates import variants_of, windows_of
 from gyrostab.diagnose.effects.cells import State, begin_state, effective
-from gyrostab.diagnose.effects.explained import Part, explain_away, take_part
+from gyrostab.diagnose.effects.explained import Part, explain_away, odd_blocks, take_part
 from gyrostab.diagnose.effects.response import is_filter, response_of
 from gyrostab.diagnose.effects.sizes import part_mixture
 from gyrostab.diagnose.modelling.refit import FORM_ERROR, Fitted
@@ -29,8 +29,6 @@ Array = NDArray[np.float64]
 _GROUPS = 150  # of blocks of like level, over which powers are averaged
 _LEAST = 24  # blocks
 _BLURRED = 1e-4  # share of its information that N must keep beside the effects
-#: Parts whose power comes from what the effect says of itself, since their own view does not hold it.
-_SAID = {"cross", "marks"}
 
 
 @dataclass
@@ -99,7 +97,7 @@ def recalibrate(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], 
             if posterior is not None:
                 changed.append(axis)
                 quiet[row] = chosen
-                columns[row] *= seen.response[:, None]
+                columns[row] = noise_powers(reduced, seen.response)[row]
                 power[row] = columns[row] @ posterior.square + seen.known
         found.append(_kept(baseline, row) if posterior is None else posterior)
     if not changed:
@@ -143,13 +141,18 @@ def _seen(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: 
             _add(out, part, naming, baseline, axis)
         numbers = next((one for one in fitted if one.claim is claim and axis in one.axes), None)
         effect = None if numbers is None else numbers.effect
-        views = {part.candidate.view for part in parts}
-        if numbers is not None and effect is not None and views & _SAID and "power" not in views:  # that part has it, with a free size
+        in_power = any(part.candidate.view == "power" for part in parts)  # which has it with a free size
+        if numbers is not None and effect is not None and not in_power and any(_only_said(part, reduced) for part in parts):
             out.known += _said(effect, reduced, axis)
             out.doubt = max([out.doubt, *(2.0 * one.stderr / abs(one.value) for one in numbers.parameters.values() if one.value)])
         if effect is not None and any(is_filter(part.candidate.view, part.variant) for part in parts):
             out.response = out.response * response_of(effect, reduced)
     return out if touched else None
+
+
+def _only_said(part: Part, reduced: xr.Dataset) -> bool:
+    """Whether the power of a part is in no column, but only in what the effect says of itself; with odd samples it may be left out."""
+    return part.candidate.view == "cross" or (part.candidate.view == "marks" and not odd_blocks(part, reduced).any())
 
 
 def _add(out: _Seen, part: Part, naming: Naming, baseline: xr.Dataset, axis: str) -> None:
@@ -207,7 +210,7 @@ def _said(effect: Effect, reduced: xr.Dataset, axis: str) -> Array:
             size = size[effect.axes.index(axis)] if len(size) > 1 else size[0]
         rows = np.asarray(density)
         out = out + float(size) ** 2 * (rows[0] if rows.ndim == 3 else rows)
-    return out
+    return effective(out[None], reduced.sel(axis=[axis]))[0]
 
 
 def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -> Posterior | None:
@@ -217,7 +220,7 @@ def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -
     chosen = chosen & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
     if chosen.sum() < _LEAST:
         return None
-    columns = noise_powers(reduced)[row] * effective(seen.response[None, None], reduced)[row][..., None]
+    columns = noise_powers(reduced, seen.response)[row]
     common, alone = (one[row] for one in common_variance(reduced))
     fit = _fit(power, _weights(shape, alone, common), columns, state.weight[row], seen, chosen)
     square, information = fit_squares(fit)

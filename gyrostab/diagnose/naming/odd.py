@@ -14,6 +14,7 @@ __all__ = ["line_size", "mark_sizes"]
 
 _PER_SPIKE = 3.0  # second differences that hold a spike
 _LIMIT = 6.0  # standard deviations beyond which one counts as an outlier
+_LAW = 0.1  # of the number and the size of outliers, by which the law of their sizes may be another
 Pair = tuple[float, float]
 
 
@@ -53,11 +54,13 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
     spread = _spread(reduced, row)
     error = math.sqrt(count + usual)
     if effect == "spikes":
-        excess = float(reduced["kurtosis"].sel(axis=axis).mean())
-        if not math.isfinite(excess):  # no block was steady enough to have one
+        told = _outliers(reduced, axis, spread)
+        if told is None:  # no block was steady enough to have a kurtosis
             return {"per_hour": (count / _PER_SPIKE / hours, error / _PER_SPIKE / hours)}
-        seen, size = _outlier(count / samples, spread, max(excess, 1e-3))
-        return {"per_hour": (count / seen / hours, error / seen / hours + 0.2 * count / seen / hours), "size": (size, 0.3 * size)}
+        seen, size, many = told
+        number = count / seen
+        doubt = math.hypot(1.0 / math.sqrt(2.0 * many), _LAW)
+        return {"per_hour": (number / hours, number / hours * math.hypot(1.0 / math.sqrt(number), _LAW)), "size": (size, doubt * size)}
     if effect == "held_samples":
         return {"per_hour": (count / hours, error / hours), "length": (1.0 / rate, 0.5 / rate)}
     share = min(count / samples, 0.999)
@@ -71,18 +74,31 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
     return {}
 
 
-def _outlier(share: float, spread: float, excess: float) -> Pair:
-    """Second differences that an outlier drives beyond the limit, on average, and its rms size, from their share and the kurtosis."""
-    from scipy.special import erfc
+def _outliers(reduced: xr.Dataset, axis: str, spread: float) -> tuple[float, float, float] | None:
+    """Second differences beyond the limit that an outlier makes on average, its rms size, and outliers told by; None where nothing tells.
 
-    limit = _LIMIT * math.sqrt(6.0) * spread
-    seen = _PER_SPIKE
-    size = spread
-    for _ in range(30):
-        size = spread * (excess * seen / (3.0 * share)) ** 0.25
-        seen = float(erfc(limit / (2.0 * size) / math.sqrt(2.0)) + 2.0 * erfc(limit / size / math.sqrt(2.0)))
-        seen = max(seen, 0.05)
-    return seen, size
+    Of a block of n samples of the deviation s with m outliers of the square u s^2 each, a = m u / n, the fourth moment over the squared
+    second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2, which is solved for a. Only the larger ones of a normal law are seen.
+    """
+    from scipy.stats import norm
+
+    count, excess, samples = (reduced[name].sel(axis=axis).values.astype(np.float64) for name in ("outliers", "kurtosis", "samples"))
+    good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
+    alone = good & (count <= _PER_SPIKE)  # of several in a block the sizes differ
+    good = alone if alone.any() else good
+    if not good.any():
+        return None
+    many = np.maximum(np.round(count[good] / _PER_SPIKE), 1.0)
+    most = samples[good] / (many * (1.0 - many / samples[good])) - 3.0  # without noise, the mean of the block taken off
+    tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * most)
+    half, far = tails - 3.0, most - tails
+    share = (half + np.sqrt(half**2 + far * half)) / far
+    square = float((share * samples[good]).sum() / many.sum())
+    limit = _LIMIT * math.sqrt(6.0)
+    ends = np.geomspace(2.0, 1e-4, 400)  # the least size that is seen, over the rms size
+    seen_squares = (0.5 * limit / ends) ** 2 * (1.0 + ends * norm.pdf(ends) / norm.sf(ends))
+    size = 0.5 * limit / float(np.interp(square, seen_squares, ends))
+    return float(2.0 * norm.sf(0.5 * limit / size) + 4.0 * norm.sf(limit / size)), size * spread, float(many.sum())
 
 
 def _spread(reduced: xr.Dataset, row: int) -> float:
