@@ -81,7 +81,7 @@ def _slid(part: Part, state: State, shift: int) -> Variant | None:
 
 
 def _alike(copy: Variant, true: Variant, row: int) -> float:
-    """Largest correlation of the columns over time."""
+    """Largest correlation of the columns over time, of either sign: so has the size."""
 
     def flat(design: NDArray[Any]) -> NDArray[Any]:
         rows = design[:, row if design.shape[1] > 1 else 0]
@@ -90,4 +90,4 @@ def _alike(copy: Variant, true: Variant, row: int) -> float:
 
     a, b = flat(copy.design), flat(true.design)
     size = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
-    return float(np.max((a * b).sum(axis=1) / np.where(size > 0, size, 1.0)))
+    return float(np.max(np.abs((a * b).sum(axis=1)) / np.where(size > 0, size, 1.0)))

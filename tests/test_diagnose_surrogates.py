@@ -1,0 +1,44 @@
+"""Slid copies of a channel, against which an effect that follows it must stand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.naming.surrogates import beats_slides
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.simulate import simulate
+
+
+def _slides(sensitivity: float, period: float) -> tuple[bool, float]:
+    """Of a bias that follows a temperature which swings with this period [s]."""
+    swing = [[t, 40.0 + 20.0 * np.sin(2.0 * np.pi * t / period)] for t in np.arange(0.0, 1801.0, 15.0).tolist()]
+    model = {
+        "log": {"axes": ["x"]},
+        "noise": {"N": 0.003, "B": 0.004, "K": 0.02},
+        "effect": [{"name": "temperature_bias", "sensitivity": sensitivity}],
+        "environment": [{"profile": "ramps", "channel": "temperature", "unit": "degree_Celsius", "points": swing}],
+    }
+    reduced = reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
+    baseline = calibrate(reduced)
+    known, _ = effect_candidates(reduced, baseline["coefficient"])
+    one = next(one for one in known if one.effect == "temperature_bias" and one.view == "mean")
+    variant = next(each for each in one.variants if each.columns == ("sensitivity",))
+    return beats_slides([Part(one, variant, ("x",), 50.0)], begin_state(reduced, baseline), fold_blocks(reduced))
+
+
+def test_a_channel_that_swings_is_no_worse_for_its_mirror_image():
+    """Half a period on it is the same channel with the other sign, which a size of either sign follows as well."""
+    beats, p_value = _slides(0.02, 600.0)
+    assert beats
+    assert p_value == 0.0
+
+
+def test_a_channel_that_does_nothing_does_not_stand():
+    beats, p_value = _slides(0.0, 1300.0)
+    assert not beats
+    assert p_value > 0.01
