@@ -125,6 +125,7 @@ def test_ncdump_reads_it(files):
         ("avar", "radian2 s-2", (np.pi / 180 / 3600) ** 2),
         ("window_mean", "radian s-1", np.pi / 180 / 3600),
         ("Q", "radian", 1e-6),
+        ("Q", "arcsecond", 0.648 / np.pi),
         ("N", "radian s-1", np.pi / 180 / 3600),
         ("B", "radian s-1", np.pi / 180 / 3600),
         ("K", "radian s-1", np.pi / 180 / 3600),

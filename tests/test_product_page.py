@@ -17,7 +17,7 @@ import pytest
 
 import gyrostab
 from gyrostab.noise import LAWS
-from gyrostab.schema import ESTIMATORS, OBSERVABLE, VARIABLES
+from gyrostab.schema import ESTIMATORS, GAP_CAUSES, OBSERVABLE, VARIABLES
 from tests import synthetic
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "product.md"
@@ -75,7 +75,7 @@ def test_the_table_is_that_of_a_product(product, text):
 
 
 def test_every_flag_is_explained(text):
-    for number, meaning in [*enumerate(OBSERVABLE), *enumerate(ESTIMATORS)]:
+    for number, meaning in [*enumerate(OBSERVABLE), *enumerate(ESTIMATORS), *enumerate(GAP_CAUSES)]:
         assert re.search(rf"^\| {number} \| `{meaning}`", text, re.M)
 
 
