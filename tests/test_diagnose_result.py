@@ -43,6 +43,14 @@ def test_what_is_made_by_hand_after_the_contract_passes():
     check_diagnosis(json.loads(diagnosis().to_json()))
 
 
+def test_every_key_is_explained_on_the_page():
+    text = (Path(__file__).resolve().parents[1] / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    section = text[text.index("## What stands in `diagnosis.json`") :].split("\n## ")[0]
+    keys = {str(key) for place in _places(content()) for key in place[-1:] if isinstance(key, str)}
+    assert keys > {"verdict", "held_out", "nats"}
+    assert not [key for key in [*keys, *VERDICTS] if f"`{key}`" not in section]
+
+
 def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Every key of the content, apart from what may have any name."""
     found = []
