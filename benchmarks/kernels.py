@@ -33,9 +33,9 @@ import xarray as xr
 from page import renew
 
 from gyrostab import davar, make_log
+from gyrostab.davar.plan import last_sample, units_of_work
 from gyrostab.kernels.integrate import present_runs
 from gyrostab.kernels.surface import Unit, surface_unit
-from gyrostab.plan import last_sample, units_of_work
 from gyrostab.windows import averaging_factors, thin
 
 RATE = 100.0

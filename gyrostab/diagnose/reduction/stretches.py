@@ -9,10 +9,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.channels import in_memory
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.simulate.drivers import Source, make_source
+from gyrostab.store import direct
 
 __all__ = ["Stretch", "channel_at", "channel_means", "numeric_channels", "read_stretches", "row_count", "sample_count"]
 
@@ -128,7 +128,7 @@ def _loaded(signal: Any, beside: Sequence[Any], low: int, high: int) -> Array:
 def channel_at(source: Source, instants: NDArray[np.int64], carry: float | None) -> tuple[Array, float | None]:
     """Values of a channel at rising `instants` [ns since 1970], and what the call for the next ones must be given."""
     stretch = source.stretch(int(instants[0]) - 1, int(instants[-1]))
-    part = None if stretch is None else (stretch, in_memory(source.values[stretch.low : stretch.high]))
+    part = None if stretch is None else (stretch, direct.stretch(source.values, stretch.low, stretch.high))
     return source.at(instants, part, carry)
 
 
@@ -158,7 +158,7 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
     low = 0
     while low < edges.size - 1:
         high = max(int(np.searchsorted(ends, ends[low] + _LONG, side="right")) - 1, low + 1)
-        values = np.asarray(in_memory(data[ends[low] : ends[high]]), dtype=np.float64)
+        values = np.asarray(direct.stretch(data, ends[low], ends[high]), dtype=np.float64)
         good = np.isfinite(values)
         at = np.repeat(np.arange(low, high), np.diff(ends[low : high + 1]))[good]
         sums += np.bincount(at, (values**2 if rms else values)[good], minlength=sums.size)

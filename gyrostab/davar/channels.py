@@ -18,14 +18,9 @@ from gyrostab.store.direct import stretch
 from gyrostab.timegrid import first_stamp, grid_times
 from gyrostab.units import INNER
 
-__all__ = ["in_memory", "window_channels"]
+__all__ = ["window_channels"]
 
 TEMPERATURE_RATE = "K hour-1"
-
-
-def in_memory(values: Any) -> NDArray[np.generic]:
-    """The array itself; one of dask is computed in the calling thread, whatever scheduler is set."""
-    return np.asarray(values.compute(scheduler="synchronous") if isinstance(values, da.Array) else values)
 
 
 def window_channels(

@@ -14,7 +14,8 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.channels import in_memory, window_channels
+from gyrostab.davar.channels import window_channels
+from gyrostab.davar.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
 from gyrostab.errors import OptionError
 from gyrostab.kernels.covariance import diagonal_products
 from gyrostab.kernels.least_squares import identify_noise
@@ -22,9 +23,8 @@ from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_theta
 from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
 from gyrostab.noise import HOUR, avar_columns, sample_squares
-from gyrostab.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
 from gyrostab.schema import attributes
-from gyrostab.store.direct import can_fill, fill_row
+from gyrostab.store.direct import can_fill, fill_row, stretch
 from gyrostab.timegrid import first_stamp, grid_times
 
 __all__ = ["davar", "davar_part", "davar_parts"]
@@ -222,7 +222,7 @@ def _rows(data: Any, begin: int, end: int) -> Iterator[NDArray[np.generic]]:
         return
     together = 1 if data.shape[0] * (end - begin) > _TOGETHER else data.shape[0]
     for row in range(0, data.shape[0], together):
-        yield from in_memory(data[row : row + together, begin:end])
+        yield from stretch(data[row : row + together], begin, end)
 
 
 def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
