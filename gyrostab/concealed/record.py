@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from gyrostab.concealed import floor, tool
 from gyrostab.concealed.environment import sense
 from gyrostab.concealed.world import AXES, QUICK, Effect, World, stream, to_samples
-from gyrostab.schema import GAP_CAUSES, check_log
-from gyrostab.timegrid import grid_times, time_coordinate
+from gyrostab.gaps import gap_variables
+from gyrostab.schema import check_log
+from gyrostab.timegrid import time_coordinate
 
 __all__ = ["base_noise", "channels_of", "gap_columns", "lost", "make_log", "signal", "with_channels"]
 
@@ -112,16 +113,8 @@ def channels_of(world: World, effects: Sequence[Effect], rng: np.random.Generato
 def gap_columns(missing: NDArray[np.bool_], *, start: int, rate: float) -> dict[str, Any]:
     """The table of gaps of a log, from what is missing."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]))).reshape(-1, 2)
-    stamps = grid_times(start, rate, edges).view("datetime64[ns]")
-    length = (edges[:, 1] - edges[:, 0]).astype(np.int64)
-    flags = {"flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8), "flag_meanings": " ".join(GAP_CAUSES)}
-    return {
-        "gap_start": ("gap", stamps[:, 0], {"long_name": "first missing sample"}),
-        "gap_end": ("gap", stamps[:, 1], {"long_name": "first present sample after the gap"}),
-        "gap_samples": ("gap", length, {"long_name": "samples missing", "units": "1"}),
-        "gap_rows": ("gap", np.zeros_like(length), {"long_name": "rows concerned", "units": "1"}),
-        "gap_cause": ("gap", np.zeros(length.size, dtype=np.int8), {"long_name": "cause of the gap", **flags}),
-    }
+    length, none = edges[:, 1] - edges[:, 0], np.zeros(len(edges), dtype=np.int64)
+    return gap_variables(np.column_stack([edges, length, none, none]), start, rate)
 
 
 def make_log(record: Array, channels: dict[str, tuple[Array, float]], *, start: int, rate: float) -> xr.Dataset:
