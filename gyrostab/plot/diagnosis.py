@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.plot.style import COLOURS, GREY, label_log_axis, new_figure, unit_label
+from gyrostab.plot.style import COLOURS, GREY, label_log_axis, log_edges, new_figure, unit_label, unit_of_time
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,13 +29,6 @@ _PALE = 0.3  # opacity of what chance does in 95 of 100
 _LEAST_WIDTH = 0.012  # of the panel, that a box is drawn
 
 
-def _unit_of_time(whole: float) -> tuple[float, str]:
-    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
-        if whole >= 3 * size:
-            return size, name
-    return 1.0, "s"
-
-
 def _edges(begin: Array, end: Array) -> Array:
     """Edges of windows that may overlap: halfway between their centres."""
     centre = (begin + end) / 2.0
@@ -43,13 +36,6 @@ def _edges(begin: Array, end: Array) -> Array:
         return np.array([begin[0], end[0]])
     inner = (centre[1:] + centre[:-1]) / 2.0
     return np.concatenate([[begin[0]], inner, [end[-1]]])
-
-
-def _log_edges(tau: Array) -> Array:
-    if tau.size == 1:
-        return np.array([tau[0] / 1.5, tau[0] * 1.5])
-    inner = np.sqrt(tau[1:] * tau[:-1])
-    return np.concatenate([[tau[0] ** 2 / inner[0]], inner, [tau[-1] ** 2 / inner[-1]]])
 
 
 def _time_of(text: str, start: str) -> float:
@@ -61,7 +47,7 @@ def _boxes(panel: Axes, axis: str, content: Mapping[str, Any], size: float, *, t
     from matplotlib.patches import Rectangle
 
     start = content["recording"]["start"]
-    low_edge, high_edge = _log_edges(taus)[[0, -1]]
+    low_edge, high_edge = log_edges(taus)[[0, -1]]
     left, right = panel.get_xlim()
     for box in content["mismatches"]:
         if axis not in box["axes"] or box["view"] not in ("davar", "cross_axis") or not box["tau_min_s"]:
@@ -89,7 +75,7 @@ def _maps(
 
     names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
     begin, end = surfaces["begin"].values, surfaces["end"].values
-    size, unit = _unit_of_time(float(end[-1]))
+    size, unit = unit_of_time(float(end[-1]))
     height = 1.1 + 2.3 * len(names)
     figure = new_figure(12.0, height, stacked=True)
     figure.subplots_adjust(left=0.075, right=0.9, top=1.0 - 0.35 / height, bottom=0.6 / height, wspace=0.06, hspace=0.08)
@@ -97,7 +83,7 @@ def _maps(
     for row, name in enumerate(names):
         for column, (title, values, opaque) in enumerate(columns):
             panel = panels[row, column]
-            edges = _edges(begin, end) / size, _log_edges(tau)
+            edges = _edges(begin, end) / size, log_edges(tau)
             missing = np.ma.masked_where(np.isfinite(values[row]), np.full(values[row].shape, 0.2))
             panel.pcolormesh(*edges, missing.T, cmap="Greys", vmin=0.0, vmax=1.0, rasterized=True)
             alpha = None if opaque is None else np.where(np.isfinite(values[row]), opaque[row], 0.0).T
@@ -105,7 +91,7 @@ def _maps(
             panel.pcolormesh(*edges, shown.T, norm=norm, cmap=cmap, rasterized=True, alpha=alpha)
             panel.set_yscale("log")
             panel.set_xlim(begin[0] / size, end[-1] / size)
-            panel.set_ylim(*_log_edges(tau)[[0, -1]])
+            panel.set_ylim(*log_edges(tau)[[0, -1]])
             _boxes(panel, name, content, size, taus=tau, faint=column > 0)
             if row == 0:
                 panel.set_title(title)
@@ -179,7 +165,7 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     """
     names = [str(name) for name in surfaces["axis"].values]
     channels = _channels(surfaces, content)
-    size, unit = _unit_of_time(float(surfaces["end"].values[-1]))
+    size, unit = unit_of_time(float(surfaces["end"].values[-1]))
     time = (surfaces["begin"].values + surfaces["end"].values) / (2.0 * size)
     block = (surfaces["block_begin"].values + surfaces["block_end"].values) / (2.0 * size)
     ratios = [1.9] * len(names) + [1.3] * len(channels)

@@ -28,12 +28,14 @@ __all__ = [
     "duration",
     "embedded",
     "label_log_axis",
+    "log_edges",
     "new_figure",
     "save_png",
     "shade_spans",
     "stack_panels",
     "time_axis",
     "unit_label",
+    "unit_of_time",
     "window_text",
 ]
 
@@ -78,6 +80,25 @@ def duration(seconds: float) -> str:
         if seconds >= size:
             return f"{seconds / size:.4g} {name}"
     return f"{seconds:.3g} s"
+
+
+def unit_of_time(seconds: float) -> tuple[float, str]:
+    """The largest unit of which a length of time holds three: its seconds, and its name.
+
+    Examples
+    --------
+    >>> unit_of_time(7200.0)
+    (60.0, 'min')
+    """
+    return next(((size, name) for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")) if seconds >= 3 * size), (1.0, "s"))
+
+
+def log_edges(values: NDArray[Any]) -> NDArray[Any]:
+    """Edges of cells around rising values on a logarithmic axis: half-way between them."""
+    logs = np.log(values)
+    inner = (logs[1:] + logs[:-1]) / 2
+    first, last = (logs[1] - logs[0], logs[-1] - logs[-2]) if values.size > 1 else (1.0, 1.0)
+    return np.asarray(np.exp([logs[0] - first / 2, *inner, logs[-1] + last / 2]))
 
 
 def window_text(product: xr.Dataset) -> str:

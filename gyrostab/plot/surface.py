@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.plot.style import axis_names, label_log_axis, new_figure, stack_panels, time_axis, window_text
+from gyrostab.plot.style import axis_names, label_log_axis, log_edges, new_figure, stack_panels, time_axis, unit_of_time, window_text
 from gyrostab.schema import ESTIMATORS, check_surface
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     time, tau = product["time"].values, product["tau"].values
     cells, merged = _columns(product, names, columns)
-    time_edges, tau_edges = _time_edges(time, merged, product.attrs.get("step_s")), _tau_edges(tau)
+    time_edges, tau_edges = _time_edges(time, merged, product.attrs.get("step_s")), log_edges(tau)
     if relative:
         cells = [(_over_median(deviation), weighted) for deviation, weighted in cells]
     norm = LogNorm(*_limits([deviation for deviation, _ in cells], relative=relative))
@@ -126,7 +126,7 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
     ((deviation, _),), merged = _columns(product, [name], columns)
     time = product["time"].values
     seconds = (time[::merged] - time[0]) / np.timedelta64(1, "s")
-    unit, size = next((u, s) for u, s in (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0)) if seconds[-1] >= 3 * s or s == 1.0)
+    size, unit = unit_of_time(seconds[-1])
     figure = new_figure(9.0, 6.5)
     panel: Any = figure.add_subplot(projection="3d")
     x, y = np.meshgrid(seconds / size, np.log10(product["tau"].values), indexing="ij")
@@ -200,13 +200,6 @@ def _time_edges(time: NDArray[Any], merged: int, step: Any) -> NDArray[Any]:
     half = int(float(step) * 5e8) if step is not None else int(np.median(np.diff(stamps)) // 2) if stamps.size > 1 else 5 * 10**8
     inner = [stamps[i - 1] + (stamps[i] - stamps[i - 1]) // 2 for i in range(merged, stamps.size, merged)]
     return np.array([stamps[0] - half, *inner, stamps[-1] + half]).astype("datetime64[ns]")
-
-
-def _tau_edges(tau: NDArray[Any]) -> NDArray[Any]:
-    logs = np.log(tau)
-    inner = (logs[1:] + logs[:-1]) / 2
-    first, last = (logs[1] - logs[0], logs[-1] - logs[-2]) if tau.size > 1 else (1.0, 1.0)
-    return np.asarray(np.exp([logs[0] - first / 2, *inner, logs[-1] + last / 2]))
 
 
 def _mark_weighted(panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], weighted: NDArray[Any]) -> None:
