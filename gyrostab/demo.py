@@ -167,12 +167,10 @@ def run_demo(folder: str | Path, *, overwrite: bool = False, stage: Stage = no_s
 
 
 def _prepare(folder: Path, *, overwrite: bool) -> dict[str, Path]:
+    from gyrostab.output import make_folder
     from gyrostab.run import check_output
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"folder {str(folder)!r} cannot be made ({error.strerror}); give another one with -o") from error
+    make_folder(folder)
     return {name: check_output(folder / name, overwrite=overwrite) for name in FILES}
 
 

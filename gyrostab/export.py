@@ -24,7 +24,8 @@ from gyrostab.store import Misfit, Progress, append_netcdf, append_zarr, as_coun
 
 __all__ = ["open_dataset", "open_log", "open_product", "open_surface", "to_netcdf", "to_zarr"]
 
-_CHUNK = 2**17  # values in one compressed chunk: 1 MiB of float64
+#: Values in one compressed chunk of a surface or product: 1 MiB of float64.
+CHUNK_VALUES = 2**17
 
 
 def to_netcdf(
@@ -217,7 +218,7 @@ def _is_data(dataset: xr.Dataset, name: Any) -> bool:
 def _chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
     """One axis (and one term) a chunk, every tau, and as much time as fits; of a log 20 minutes."""
     inner = int(np.prod([size for dim, size in variable.sizes.items() if dim not in ("axis", "term", variable.dims[-1])]))
-    most = max(1, _CHUNK // max(1, inner))
+    most = max(1, CHUNK_VALUES // max(1, inner))
     if rate is not None:
         most = chunk_samples(rate if variable.dims[-1] in ("time", index_dim("time")) else 0.0)
     last = max(1, min(variable.shape[-1], most))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gyrostab.errors import FormatError, OutputError
 
-__all__ = ["damaged_input", "new_output"]
+__all__ = ["damaged_input", "make_folder", "new_output"]
 
 #: Looks, 20 ms apart, after which what has gone stays gone: a busy machine may hold a thread up that long.
 _LOOKS = 15
@@ -78,6 +78,14 @@ def new_output(path: str | os.PathLike[str], *, overwrite: bool = False, directo
         raise OutputError(f"{path}: cannot be written: {_reason(error, path)}") from error
     finally:
         _remove(temporary)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, with those above it, unless it is there; raise `OutputError` when that fails."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"folder {str(folder)!r} cannot be made ({error.strerror}); give another one with -o") from error
 
 
 def _check_target(path: Path, *, overwrite: bool, directory: bool) -> None:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from gyrostab.correlate import correlate
 from gyrostab.errors import OutputError
-from gyrostab.output import new_output
+from gyrostab.output import make_folder, new_output
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
 from gyrostab.plot.correlation import plot_correlation
@@ -89,10 +89,7 @@ def save_figures(product: xr.Dataset, folder: str | os.PathLike[str], *, dpi: in
     """
     folder = Path(folder)
     figures = {folder / (re.sub(r"[^\w.-]", "_", name) + ".png"): draw for name, draw in product_figures(product).items()}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"folder {str(folder)!r} cannot be made ({error.strerror}); give another one with -o") from error
+    make_folder(folder)
     if not overwrite and (there := [path.name for path in figures if path.exists()]):
         raise OutputError(f"{folder} holds {', '.join(there)} already; give --overwrite to replace them, or another folder with -o")
     for path, draw in figures.items():

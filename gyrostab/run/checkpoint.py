@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.export import CHUNK_VALUES
 from gyrostab.output import new_output
 
 __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
@@ -24,7 +25,6 @@ __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
 _MAGIC = b"GYROBLK1"
 _ALIGN = 64
 _SMALL = 2**26  # bytes of blocks up to which a product is put together in memory
-_CHUNK = 2**17  # values in one compressed chunk of a product: `gyrostab.export`
 
 
 class Block(NamedTuple):
@@ -198,7 +198,7 @@ def _lazily(blocks: Sequence[Block], name: str) -> Any:
     shape = [int(edges[-1]) if i == along else size for i, size in enumerate(described["shape"])]
     dims = list(zip(described["dims"], shape, strict=True))
     inner = int(np.prod([size for dim, size in dims if dim not in ("axis", "term", "time")]))
-    sizes = {"axis": 1, "term": 1, "time": max(1, min(shape[along], _CHUNK // max(1, inner)))}
+    sizes = {"axis": 1, "term": 1, "time": max(1, min(shape[along], CHUNK_VALUES // max(1, inner)))}
 
     def read(block_info: Mapping[Any, Any]) -> NDArray[Any]:
         location = block_info[None]["array-location"]
