@@ -39,7 +39,7 @@ def groups(shifts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 @njit(**INNER)
-def _limit(i, count, first, low, high, stop, step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):  # type: ignore[no-untyped-def]
+def _limit(i, count, first, high, stop, step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):  # type: ignore[no-untyped-def]
     """Terms of the head and of head and tail, from `first` on, of `count` averaging factors from number i on; the most of them."""
     shift = shifts[i]
     up = (1 << shift) - 1
@@ -88,7 +88,7 @@ def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_l
                     low = max(sub, starts[r])
                     first = (low + (1 << shift) - 1) >> shift
                     count = groups[g + 1] - i
-                    if _limit(i, count, first, low, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
+                    if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
                         split_sums(flat, places[i] + first, count, lags, i, splits, sizes, out)
                         for q in range(count):
                             heads[block, i + q] += out[q]
