@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from threadpoolctl import threadpool_limits
 
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.effects.cells import State, begin_state
@@ -23,12 +22,7 @@ from tests.named import nulls
 
 BLOCKS, LENGTH = 120, 200
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """As `gyrostab.diagnose` has it."""
-    with threadpool_limits(1, user_api="blas"):
-        yield
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Dataset:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from threadpoolctl import threadpool_limits
 
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model
 from gyrostab.diagnose.calibration.lattice import angle_share, rounded_rates
@@ -14,13 +13,7 @@ from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.log import make_log
 from tests.named import nulls
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """As `gyrostab.diagnose` has it."""
-    with threadpool_limits(1, user_api="blas"):
-        yield
-
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 SCATTER = 0.003 * 60.0 * np.sqrt(10.0)  # of a sample at 10 Hz [deg/h]
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from threadpoolctl import threadpool_limits
 
 from gyrostab.diagnose.effects.designs import Candidate, Variant
 from gyrostab.diagnose.effects.explained import Part
@@ -22,12 +21,7 @@ from tests.named import nulls
 
 WEIGHT = np.full((1, 8), 22.0)
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """As `gyrostab.diagnose` has it."""
-    with threadpool_limits(1, user_api="blas"):
-        yield
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def spectra(density: np.ndarray, *, records: int = 20, seed: int = 1) -> np.ndarray:

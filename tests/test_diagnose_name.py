@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from threadpoolctl import threadpool_limits
 
 from gyrostab.diagnose.effects.explained import Part, explain_away
 from gyrostab.diagnose.effects.search import together
@@ -21,12 +20,7 @@ from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.errors import OptionError
 from tests.named import WORLD, nulls, record
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """As `gyrostab.diagnose` has it: threads of the linear algebra would only wait for each other."""
-    with threadpool_limits(1, user_api="blas"):
-        yield
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def named(effects, *, environment=WORLD["usual"], seed=1, drop=(), count=40):

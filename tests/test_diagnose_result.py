@@ -292,7 +292,8 @@ def test_the_page_escapes_names(tmp_path: Path):
 def test_the_page_takes_any_number_of_axes(tmp_path: Path, axes: str):
     one = content()
     one["recording"]["axes"] = list(axes)
-    write_diagnosis_report(Diagnosis(one, surfaces(axes=axes), model()), tmp_path / "report.html")
+    page = write_diagnosis_report(Diagnosis(one, surfaces(axes=axes), model()), tmp_path / "report.html")
+    assert page.read_text(encoding="utf-8").count("<img") == 5
 
 
 def test_the_command_report_takes_the_folder_too(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
