@@ -74,7 +74,7 @@ def test_statistics_are_those_of_raw_logs(lost):
 def test_lattices_give_repeats_zeros_and_extremes():
     record = raw(1, 0.0, lattice=0.5)
     nulls = joined(list(null_records(record, calibrate(record), count=50, rng=np.random.default_rng(1))))
-    for name, scatter in (("repeats", 4.0), ("zeros", 4.0)):
+    for name, scatter in (("repeats", 4.0), ("zeros", 4.0), ("stuck", 4.0), ("filled", 6.0)):
         many = float(nulls[name].sum("block").mean())
         assert float(record[name].sum()) == pytest.approx(many, abs=scatter * np.sqrt(many))
     extremes = nulls["extremes"].sum("block")

@@ -98,9 +98,9 @@ def block_samples(x, centred, moments, counts, histogram):  # type: ignore[no-un
         Is filled with the values less their block's mean, 0 where missing.
     moments : ndarray, shape (block, 5)
         Is filled with mean, second and fourth central moment, smallest and largest value; NaN in an empty block.
-    counts : ndarray of int64, shape (block, 5)
-        Is filled with the samples present, exact zeros, samples equal to the one before, and samples equal to the smallest and to
-        the largest value of the block.
+    counts : ndarray of int64, shape (block, 7)
+        Is filled with the samples present, exact zeros, samples equal to the one before but for zeros, samples equal to the smallest
+        and to the largest value of the block, and how many of these two are equal to the one before and no zeros.
     histogram : ndarray of uint32, shape (block, `HISTOGRAM`) or (0, 0)
         Is filled with the number of second differences by size, unless it is empty.
     """
@@ -118,11 +118,11 @@ def block_samples(x, centred, moments, counts, histogram):  # type: ignore[no-un
             present += 1
             total += value - first
             zeros += value == 0.0
-            repeats += i > 0 and value == row[i - 1]
+            repeats += i > 0 and value == row[i - 1] and value != 0.0
             low, high = min(low, value), max(high, value)
         mean = first + total / max(present, 1)
         second, fourth = 0.0, 0.0
-        lows, highs = 0, 0
+        lows, highs, lows_again, highs_again = 0, 0, 0, 0
         for i in range(size):
             value = row[i]
             if value != value:
@@ -134,12 +134,16 @@ def block_samples(x, centred, moments, counts, histogram):  # type: ignore[no-un
             centred[b, i] = value - mean
             lows += value == low
             highs += value == high
+            if i > 0 and value == row[i - 1] and value != 0.0:
+                lows_again += value == low
+                highs_again += value == high
         if histogram.shape[0] > 0:
             for i in range(2, size):
                 difference = abs(row[i] - row[i - 1] - row[i - 1] + row[i - 2])
                 if difference == difference:
                     histogram[b, _bin(difference)] += np.uint32(1)
         counts[b, 0], counts[b, 1], counts[b, 2], counts[b, 3], counts[b, 4] = present, zeros, repeats, lows, highs
+        counts[b, 5], counts[b, 6] = lows_again, highs_again
         moments[b, 0], moments[b, 1], moments[b, 2] = mean, second / max(present, 1), fourth / max(present, 1)
         moments[b, 3], moments[b, 4] = low, high
         if present == 0:

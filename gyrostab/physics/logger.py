@@ -367,7 +367,7 @@ class HeldSamples(Effect):
         if self.fill == "zero":
             share = count / windows.rate / _HOUR
             own = np.stack([windows.own[axis] for axis in windows.axes])
-            return Prediction(mean={"per_hour": -share * own}, marks=("zeros",))
+            return Prediction(mean={"per_hour": -share * own}, marks=("filled",))
         growth = 2.0 * count**2 / (_HOUR * windows.rate)
         return Prediction(level={("N", "per_hour"): np.full(windows.begin.size, growth)}, marks=("repeats",))
 

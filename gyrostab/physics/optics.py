@@ -79,7 +79,7 @@ class DeadZone(Effect):
         """Window means: less by the width on both sides; nothing is known inside."""
         away = np.stack([windows.own[axis] for axis in windows.axes]) - self.centre
         outside = np.sign(away) * (np.abs(away) > 0.05 * self.width)
-        return Prediction(mean={"width": -outside * (self.edge == "offset")}, marks=("zeros",))
+        return Prediction(mean={"width": -outside * (self.edge == "offset")}, marks=("stuck",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

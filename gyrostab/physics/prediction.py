@@ -91,7 +91,8 @@ class Prediction:
     line : ndarray, shape (window,) or (harmonic, window), or None
         Frequency of a line in every window [Hz], folded below half of the sampling rate.
     marks : tuple of str
-        What it raises in the distribution of the samples: outliers, repeats, extremes, zeros, lattice.
+        What it raises in the distribution of the samples: outliers, repeats (of any value but zero and the ends of the range), extremes,
+        stuck (zeros of one axis by itself), filled (zeros of all axes at once, or of a single axis in runs), lattice.
     transfer : mapping of (str, str) to complex ndarray, shape (band,)
         (parameter, channel) -> transfer function from the channel to the rate, per unit [degree hour-1 per unit of the channel]. The
         name of an axis in place of a channel stands for the rate of that axis.

@@ -23,9 +23,9 @@ __all__ = [
 
 Array = NDArray[Any]
 #: Counts of blocks that effects raise.
-COUNTS = ("outliers", "repeats", "extremes", "zeros")
+COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
 #: Statistics of the distribution that a coarse lattice makes by itself.
-OF_LATTICE = ("repeats", "extremes", "zeros", "kurtosis")
+OF_LATTICE = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
 _COARSE, _STILL = 0.2, 0.1  # step in scatters of the samples; share of the blocks that tell the scatter at rest
 _SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
 

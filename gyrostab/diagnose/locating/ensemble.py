@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from gyrostab.diagnose.calibration.expected import line_columns, white_variance
+from gyrostab.diagnose.reduction.outliers import beyond_chance
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times
 from gyrostab.noise import HOUR
 
@@ -292,11 +293,19 @@ def _counts(frame: _Frame, count: int, rng: np.random.Generator) -> dict[str, ND
             repeat[axis], zero[axis] = _lattice_chances(mean[axis], float(step), frame.sd[axis])
         if not reduced["zeros"].values[axis].any():
             zero[axis] = 0.0
+        repeat[axis] = np.maximum(repeat[axis] - zero[axis] ** 2, 0.0)
     size = (count, *samples.shape)
+    zeros = rng.binomial(samples, np.broadcast_to(zero, size))
+    near = 1.0 - (1.0 - zeros / np.maximum(samples, 1)) ** 2  # chance that a zero has another one beside it
+    at_once = rng.binomial(samples.max(axis=0), np.prod(zeros / np.maximum(samples, 1), axis=1))[:, None]
+    together = rng.binomial(zeros, near) if len(samples) == 1 else np.minimum(at_once, zeros)
+    filled = beyond_chance(together, zeros, samples)
     return {
         "outliers": rng.poisson(np.broadcast_to(samples * _TAIL, size)),
         "repeats": rng.binomial(adjacent, np.broadcast_to(repeat, size)),
-        "zeros": rng.binomial(samples, np.broadcast_to(zero, size)),
+        "zeros": zeros,
+        "stuck": zeros - filled,
+        "filled": filled,
         "extremes": _extremes(frame, samples, count, rng),
     }
 

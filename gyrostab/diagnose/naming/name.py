@@ -41,6 +41,7 @@ _SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
 _LOCKED = ("order", "phase_locked")
 _WEIGHED = ("power", "cross", "order", "phase_locked", "transfer")  # views whose weights are the expected powers
 _TAIL = 0.25
+_OF_ZEROS = {"stuck", "filled"}  # a sample that is zero is so for one reason
 
 
 def name_effects(
@@ -177,7 +178,8 @@ class _Search:
             return {"~outliers"}  # the kurtosis of a block is that of other noise
         if not any(part.candidate.view == "marks" for part in one.parts):
             return set()
-        marks = {mark for part in one.parts for mark in part.candidate.marks} | {"kurtosis"}
+        marks = {mark for part in one.parts for mark in part.variant.columns} | {"kurtosis"}
+        marks |= _OF_ZEROS if marks & _OF_ZEROS else set()
         return {other.key for other in self.candidates if other.view == "marks" and marks & set(other.marks)}
 
     def _gains(self, state: State) -> list[Found]:

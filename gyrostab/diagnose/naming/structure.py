@@ -72,6 +72,8 @@ def structural(effect: str, parts: Sequence[Part], state: State, *, lines: int =
     reduced = state.reduced
     if effect == "spectral_line" and "profile" not in reduced and lines >= _COMB:
         out.append("feedback_reset")
+    if effect == "dead_zone" and len(state.axes) == 1:  # no other axis says whether the sample was lost
+        out.append("held_samples")
     if effect == "vibration_rectification":
         vibration = reduced[f"channel_{parts[0].candidate.driver[0]}"].values
         good = np.isfinite(vibration)

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.reduction.outliers import zeros_together
 from gyrostab.diagnose.reduction.stretches import Stretch, channel_at, numeric_channels
 from gyrostab.errors import UnitError
 from gyrostab.kernels import periodogram as kernel
@@ -48,7 +49,8 @@ class Accumulator:
         self.whole_neighbours = _neighbours(whole, self.weights)[0]
         bands = self.edges.size - 1
         self.moments = np.full((rows, blocks, 5), np.nan)
-        self.counts = np.zeros((rows, blocks, 5), np.int64)
+        self.counts = np.zeros((rows, blocks, 7), np.int64)
+        self.together = np.zeros((self.axes, blocks), np.int64)
         self.histogram = np.zeros((self.axes, blocks, kernel.HISTOGRAM), np.uint32)
         self.power = np.full((rows, blocks, bands), np.nan)
         self.shape = np.full((self.axes, blocks, bands), np.nan)
@@ -85,6 +87,7 @@ class Accumulator:
             histogram = self.histogram[row, part] if row < self.axes else np.empty((0, 0), np.uint32)
             kernel.block_samples(stretch.values[row], centred[row], self.moments[row, part], self.counts[row, part], histogram)
         self._spectra(part, centred, present)
+        self.together[:, part] = zeros_together(stretch.values[: self.axes])
         self.adjacent[:, part] = np.count_nonzero(present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1)
         self._find_gaps(part, present[: self.axes])
         for name, fine in self.fine.items():

@@ -1,13 +1,15 @@
-"""What values tell beside their spectrum: how many jump out, and the lattice that they stand on."""
+"""What values tell beside their spectrum: how many jump out, where they stick, and the lattice that they stand on."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.kernels.periodogram import HISTOGRAM, histogram_edge
 
-__all__ = ["count_outliers", "lattice_step"]
+__all__ = ["beyond_chance", "count_outliers", "lattice_step", "zeros_together"]
 
 Array = NDArray[np.float64]
 _SIGMA = 6.0
@@ -39,7 +41,7 @@ def count_outliers(histogram: NDArray[np.uint32], *, sigma: float = _SIGMA) -> N
     >>> x = np.random.default_rng(1).standard_normal((50, 200))
     >>> x[7, 100] += 30.0
     >>> histogram = np.zeros((1, 50, HISTOGRAM), np.uint32)
-    >>> block_samples(x, np.empty_like(x), np.empty((50, 5)), np.empty((50, 5), np.int64), histogram[0])
+    >>> block_samples(x, np.empty_like(x), np.empty((50, 5)), np.empty((50, 7), np.int64), histogram[0])
     >>> counts = count_outliers(histogram)
     >>> int(counts[0, 7]), int(counts.sum())
     (3, 3)
@@ -63,6 +65,65 @@ def _deviation(histogram: NDArray[np.int64]) -> Array:
     before = np.take_along_axis(total, number[..., None], axis=-1)[..., 0] - inside
     share = np.divide(wanted - before, inside, out=np.ones(wanted.shape), where=inside > 0)
     return np.asarray(np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / _MEDIAN, 0.0))
+
+
+def zeros_together(values: Array) -> NDArray[np.int64]:
+    """Exact zeros that all axes have at once; on a single axis those that have another one beside them.
+
+    That is how lost samples look which were filled with zeros. A loop that sticks at zero does it in each axis by itself, whenever its
+    rate goes by.
+
+    Parameters
+    ----------
+    values : ndarray, shape (axis, block, sample)
+
+    Returns
+    -------
+    ndarray of int64, shape (axis, block)
+
+    Examples
+    --------
+    >>> zeros_together(np.array([[[0.0, 0.0, 0.0, 1.0]], [[0.0, 2.0, np.nan, 0.0]]]))
+    array([[1],
+           [1]])
+    >>> zeros_together(np.array([[[0.0, 0.0, 1.0, 0.0]]]))
+    array([[2]])
+    """
+    zero = values == 0.0
+    if not zero.any():
+        return np.zeros(zero.shape[:2], np.int64)
+    if len(zero) == 1:
+        pair = zero[..., 1:] & zero[..., :-1]
+        found = zero & (np.pad(pair, ((0, 0), (0, 0), (1, 0))) | np.pad(pair, ((0, 0), (0, 0), (0, 1))))
+    else:
+        gone = np.isnan(values)
+        found = zero & (zero | gone).all(axis=0) & (zero.sum(axis=0) > 1)
+    return np.asarray(found.sum(axis=-1))
+
+
+def beyond_chance(together: NDArray[Any], zeros: NDArray[Any], samples: NDArray[Any]) -> NDArray[np.int64]:
+    """Zeros of `zeros_together` less those that independent zeros of the axes, or of a single axis, would bring together.
+
+    Parameters
+    ----------
+    together, zeros, samples : ndarray of int, shape (..., axis, block)
+
+    Returns
+    -------
+    ndarray of int64, shape (..., axis, block)
+
+    Examples
+    --------
+    >>> beyond_chance(np.array([[30], [30]]), np.array([[40], [50]]), np.array([[100], [100]]))
+    array([[10],
+           [10]])
+    """
+    share = zeros / np.maximum(samples, 1)
+    if zeros.shape[-2] == 1:
+        chance = zeros * (1.0 - (1.0 - share) ** 2)
+    else:
+        chance = np.max(samples, axis=-2, keepdims=True) * np.prod(share, axis=-2, keepdims=True)
+    return np.asarray(np.maximum(together - np.rint(chance), 0), np.int64)
 
 
 def lattice_step(values: Array) -> float:

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduction.accumulate import FINE, FOLLOWED, HARMONICS, PARTS, PHASES, Accumulator
-from gyrostab.diagnose.reduction.outliers import count_outliers, lattice_step
+from gyrostab.diagnose.reduction.outliers import beyond_chance, count_outliers, lattice_step
 from gyrostab.diagnose.reduction.stretches import channel_means, numeric_channels, read_stretches, row_count, sample_count
 from gyrostab.errors import OptionError
 from gyrostab.kernels.smooth import smooth_curve
@@ -106,11 +106,12 @@ def reduce_log(
     -------
     xarray.Dataset
         By ``(axis, block)``: ``mean`` [degree hour-1], ``samples``, ``neighbours``, ``adjacent``, ``kurtosis``, ``outliers``,
-        ``repeats``, ``extremes``, ``zeros``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of
-        its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band), ``witness_power``, ``witness_cross``,
-        ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``, ``profile(axis, block, phase)``,
-        ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects follow late, and gaps and restarts in
-        seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
+        ``repeats``, ``extremes``, ``zeros``, and of these ``stuck`` and ``filled``. By ``(axis, block, band)``: ``power``
+        [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band),
+        ``witness_power``, ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
+        ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects
+        follow late, and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz]
+        of the bands.
 
     Raises
     ------
@@ -159,6 +160,7 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
     enough = present >= max(_MEAN_SHARE * work.length, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
+    filled = beyond_chance(work.together, counts[..., 1], present)
     lattice = np.array([lattice_step(np.concatenate([kept[row].ravel() for kept in work.kept])) for row in range(work.axes)])
     weight = np.divide(work.line_counts[..., 0] ** 2, work.line_counts[..., 1], where=work.line_counts[..., 1] > 0,
                        out=np.zeros(work.line_counts.shape[:2]))  # fmt: skip
@@ -173,9 +175,11 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
         "kurtosis": (plane, np.where(np.isnan(work.neighbours), np.nan, kurtosis), _named("excess kurtosis of the block", "1")),
         "outliers": (plane, count_outliers(work.histogram), _named("second differences beyond 6 robust sigma", "1")),
         "adjacent": (plane, work.adjacent, _named("samples with another one right before them in the block", "1")),
-        "repeats": (plane, counts[..., 2], _named("samples equal to the one before", "1")),
+        "repeats": (plane, _repeats(moments, counts), _named("samples equal to the one before, but for zeros and the ends", "1")),
         "extremes": (plane, _extremes(moments, counts), _named("samples equal to the smallest or largest of the record", "1")),
         "zeros": (plane, counts[..., 1], _named("samples that are exactly 0", "1")),
+        "stuck": (plane, _stuck(moments, counts, filled), _named("zeros of one axis, within its range", "1")),
+        "filled": (plane, filled, _named("zeros of all axes at once; of a single axis in runs", "1")),
         "lattice": ("axis", lattice, _named("step of the lattice of values, 0 for none", _RATE)),
         "line_power": (("axis", "part", "line"), lines, _named("mean periodogram at full resolution, two-sided density", _POWER)),
         "line_weight": (("axis", "part"), weight, _named("blocks in each mean, as many as equal ones would do", "1")),
@@ -188,11 +192,30 @@ def _named(name: str, units: str) -> dict[str, Any]:
     return {"long_name": name, "units": units}
 
 
+def _ends(moments: Array) -> tuple[Array, Array]:
+    """Smallest and largest value of every axis, (axis, 1)."""
+    return np.fmin.reduce(moments[..., 3], axis=1, keepdims=True), np.fmax.reduce(moments[..., 4], axis=1, keepdims=True)
+
+
+def _at_ends(moments: Array, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Counts at the smallest and largest value of each block, where these are those of the record."""
+    lowest, highest = _ends(moments)
+    return np.asarray(np.where(moments[..., 3] == lowest, low, 0) + np.where((moments[..., 4] == highest) & (lowest < highest), high, 0))
+
+
 def _extremes(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    low, high = moments[..., 3], moments[..., 4]
-    with np.errstate(invalid="ignore"):
-        lowest, highest = (np.fmin.reduce(low, axis=1, keepdims=True), np.fmax.reduce(high, axis=1, keepdims=True))
-        return np.asarray(np.where(low == lowest, counts[..., 3], 0) + np.where((high == highest) & (lowest < highest), counts[..., 4], 0))
+    return _at_ends(moments, counts[..., 3], counts[..., 4])
+
+
+def _repeats(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Held samples stand wherever the rate was: what stands at zero or at an end of the range is something else."""
+    return counts[..., 2] - _at_ends(moments, counts[..., 5], counts[..., 6])
+
+
+def _stuck(moments: Array, counts: NDArray[np.int64], filled: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Zeros of an axis by itself, unless zero is the end of its range."""
+    lowest, highest = _ends(moments)
+    return np.asarray(np.where((lowest < 0.0) & (highest > 0.0), counts[..., 1] - filled, 0))
 
 
 def _beside(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:

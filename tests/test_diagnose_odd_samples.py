@@ -1,0 +1,61 @@
+"""Samples that stand still: at zero, at the ends of the range, or wherever the rate was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.modelling.refit import fit_claims
+from gyrostab.diagnose.naming.name import Naming, name_effects
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.log import make_log
+from gyrostab.physics.registry import make_effect
+from tests.effect_bench import run
+from tests.named import nulls
+
+SCATTER = 0.5  # deg/h, of a sample
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """As `gyrostab.diagnose` has it."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
+
+
+def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -> Naming:
+    noise = mean + SCATTER * np.random.default_rng(seed).standard_normal((len(axes), 15_000))
+    effect = make_effect(table)
+    on = [axes.index(axis) for axis in effect.axes or axes]
+    noise[on] = run(effect, size=noise.shape[1], axes=axes, signal=noise[on], seed=seed)
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list(axes)))
+    baseline, records = nulls(reduced, 40)
+    return name_effects(reduced, baseline, records)
+
+
+@pytest.mark.parametrize(
+    ("table", "options"),
+    [
+        ({"name": "dead_zone", "width": 0.002, "axes": ["x"]}, {}),
+        ({"name": "dead_zone", "width": 0.2, "edge": "jump"}, {}),
+        ({"name": "dead_zone", "width": 0.2, "edge": "jump", "axes": ["x"]}, {"axes": "x"}),
+        ({"name": "held_samples", "per_hour": 60.0, "length": 0.4}, {}),
+        ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {}),
+        ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {"axes": "x"}),
+        ({"name": "clipping", "limit": 0.6, "axes": ["y"]}, {}),
+    ],
+    ids=lambda value: "-".join(map(str, value.values())),
+)
+def test_it_is_told_where_they_stand(table, options):
+    found = named(table, **options)
+    (claim,) = found.claims
+    assert claim.effect == table["name"]
+    assert claim.axes == tuple(table.get("axes", options.get("axes", "xyz")))
+    alone = table["name"] == "dead_zone" and options
+    assert claim.alternatives == (("held_samples",) if alone else ())
+    if table["name"] == "held_samples":
+        (fitted,) = fit_claims(found, calibrate(found.state.reduced))[:1]
+        assert fitted.effect is not None
+        assert fitted.effect.fill == table.get("fill", "repeat")
