@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
 from gyrostab.read import read_log
+from gyrostab.units import INNER
 
 from .text_logs import PLAIN, ns, write
 
@@ -191,3 +193,42 @@ def test_a_temperature_called_t_is_no_time(tmp_path: Path) -> None:
     raw = read_log(write(tmp_path, "time [s],gyro_x [deg/h],T [degC]\n0,1,20\n1,2,21\n"))
     assert raw["T"].values.tolist() == [20, 21]
     assert ns(read_log(write(tmp_path, "t [s],gyro_x [deg/h]\n0,1\n1,2\n"))) == [0, 10**9]
+
+
+# --- what the page on formats says ---------------------------------------------------------------------------------
+
+
+def _page() -> str:
+    text = (Path(__file__).resolve().parents[1] / "docs" / "formats.md").read_text(encoding="utf-8")
+    return text[text.index("## A log as text") :].split("\n## ")[0]
+
+
+def _named_on_the_page() -> list[tuple[str, str]]:
+    """Column and unit, each with each; the names of a row and its units go in pairs where there are several groups of units."""
+    pairs = []
+    for row in re.findall(r"^\| (`.*)\|$", _page(), re.M):
+        cells = [cell.strip() for cell in row.split("|")]
+        names, groups = re.findall(r"`(\w+)`", cells[0]), [group.split(", ") for group in cells[2].split(";")]
+        if cells[2] != "any, or none" and names != ["rotation_rate"]:
+            several = zip(names, groups, strict=True) if len(groups) > 1 else [(name, groups[0]) for name in names]
+            pairs += [(name, unit.strip()) for name, units in several for unit in units]
+    assert {("angle_x", "arcsec"), ("gyro_z", "rpm"), ("pressure", "psi"), ("time", "us"), ("mag_y", "nT")} < set(pairs)
+    return pairs
+
+
+def test_every_unit_on_the_page_is_understood(tmp_path: Path) -> None:
+    for name, unit in _named_on_the_page():
+        others = [] if name == "time" else ["time [s]"]
+        header = ",".join([*others, f"{name} [{unit}]", *([] if name.startswith(("gyro", "angle")) else ["gyro_w [deg/h]"])])
+        path = write(tmp_path, f"{header}\n" + "".join(f"{row},{row}" + ",1" * (header.count(",") - 1) + "\n" for row in range(2)))
+        raw = read_log(path, kind="angle" if name.startswith("angle") else None)
+        assert name in ("time", *raw.data_vars) or name.split("_")[1] in raw["axis"], (name, unit)
+        if name in raw.data_vars:
+            assert raw[name].units in INNER.values(), (name, unit)
+
+
+def test_the_log_on_the_page_is_read(tmp_path: Path) -> None:
+    raw = read_log(write(tmp_path, "\n".join(line[4:] for line in _page().splitlines() if line.startswith("    ")) + "\n"))
+    assert raw["axis"].values.tolist() == ["x", "y", "z"]
+    assert raw["temperature"].values[0] == 61.2
+    assert np.diff(ns(raw)).tolist() == [10_000_000]
