@@ -14,8 +14,9 @@ from gyrostab.diagnose.effects.cells import begin_state
 from gyrostab.diagnose.effects.explained import Part, explain_away
 from gyrostab.diagnose.effects.search import Tallies
 from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
-from gyrostab.diagnose.modelling.refit import fit_claims, predicted
+from gyrostab.diagnose.modelling.refit import fit_claims
 from gyrostab.diagnose.naming.claims import Claim, Naming
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.simulate import simulate

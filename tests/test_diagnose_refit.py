@@ -14,7 +14,9 @@ from gyrostab.diagnose.effects.cells import begin_state
 from gyrostab.diagnose.effects.explained import Part, explain_away
 from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.modelling.refit import FORM_ERROR, fit_claims, limits, predicted
+from gyrostab.diagnose.modelling.limits import limits
+from gyrostab.diagnose.modelling.predict import predicted
+from gyrostab.diagnose.modelling.refit import FORM_ERROR, fit_claims
 from gyrostab.diagnose.naming.name import Claim, Naming, name_effects
 from gyrostab.diagnose.naming.odd import line_size
 from gyrostab.simulate import simulate

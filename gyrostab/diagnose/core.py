@@ -33,8 +33,10 @@ from gyrostab.diagnose.conclusion.surfaces import make_surfaces
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import NullScores, null_scores
+from gyrostab.diagnose.modelling.limits import limits
+from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
-from gyrostab.diagnose.modelling.refit import fit_claims, limits, predicted
+from gyrostab.diagnose.modelling.refit import fit_claims
 from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
 from gyrostab.diagnose.naming.name import Naming, name_effects
 from gyrostab.diagnose.reduction.reduced import reduce_log

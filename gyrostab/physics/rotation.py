@@ -209,7 +209,7 @@ class EarthRate(Effect):
         high = north * math.cos(inc) * math.cos(azi) - down * math.sin(inc)
         return along, high, -north * math.sin(azi)
 
-    def _directions(self, axes: tuple[str, ...]) -> tuple[Array, Array]:
+    def directions(self, axes: tuple[str, ...]) -> tuple[Array, Array]:
         """Angles of the axes from the tool's axis and around it [radian]."""
         if self.off or self.around:  # across the tool unless it is said how far off
             off = self.each("off", axes) if self.off else np.full(len(axes), 90.0)
@@ -223,7 +223,7 @@ class EarthRate(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Turns of the tool so far."""
-        self._directions(setup.axes)
+        self.directions(setup.axes)
         return 0.0
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
@@ -234,7 +234,7 @@ class EarthRate(Effect):
     def _seen(self, middle: Array, inside: Array, axes: tuple[str, ...]) -> Array:
         """Mean over intervals of what the axes see."""
         along, high, right = self.components()
-        off, around = self._directions(axes)
+        off, around = self.directions(axes)
         phase = math.radians(self.toolface) + around - math.atan2(right, high)
         across = math.hypot(high, right) * np.sin(off)
         return np.asarray(along * np.cos(off)[:, None] + across[:, None] * turn_means(middle, inside, phase[:, None]))
@@ -247,7 +247,7 @@ class EarthRate(Effect):
         """Window means, and where the line shows."""
         rotation = windows.drivers["rotation_rate"]
         seen = self._seen(*turns_of_windows(windows, rotation), windows.axes)
-        off, around = self._directions(windows.axes)
+        off, around = self.directions(windows.axes)
         across = math.hypot(*self.components()[1:]) / self.rate if self.rate else 0.0
         pattern = np.zeros((len(windows.axes), 3), np.complex128)
         pattern[:, 0] = across * np.sin(off) * np.exp(1j * around)

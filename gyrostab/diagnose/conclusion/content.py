@@ -25,7 +25,8 @@ from gyrostab.diagnose.conclusion.sentences import (
 )
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.generics import GENERICS
-from gyrostab.diagnose.modelling.refit import Fitted, Limit
+from gyrostab.diagnose.modelling.limits import Limit
+from gyrostab.diagnose.modelling.refit import Fitted
 from gyrostab.diagnose.naming.name import Claim, Naming, Unknown
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.noise import LAWS

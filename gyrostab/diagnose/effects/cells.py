@@ -19,7 +19,7 @@ from gyrostab.diagnose.gains.gain import Cells, independent, noise_columns
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.kernels.periodogram import taper
 
-__all__ = ["State", "begin_state", "cells_of", "drawn", "effective", "in_place", "pair_rows", "view_rows"]
+__all__ = ["State", "begin_state", "cells_of", "drawn", "effective", "in_place", "pair_rows", "view_rows", "witness_power"]
 
 Array = NDArray[Any]
 
@@ -273,10 +273,17 @@ def witness_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset) -> tu
         for number, pair in enumerate(pair_rows(reduced)):
             if set(pair) == {name, axes[row]} and name != axes[row]:
                 found = np.where(there, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan)
-        return found, measured(reduced, "power").sel(axis=name).transpose("block", "band").values
+        return found, witness_power(name, reduced)
     place = [str(one) for one in reduced["witness"].values].index(name)
     cross = _records(data["witness_cross"].transpose(..., "axis", "witness", "block", "band").values, 4)
-    return cross[row, place], reduced["witness_power"].transpose("witness", "block", "band").values[place]
+    return cross[row, place], witness_power(name, reduced)
+
+
+def witness_power(name: str, reduced: xr.Dataset) -> Array:
+    """Power of a channel on the log's time, or of an axis as it measured, (block, band)."""
+    if name in reduced["axis"].values:
+        return np.asarray(measured(reduced, "power").sel(axis=name).transpose("block", "band").values)
+    return np.asarray(reduced["witness_power"].sel(witness=name).transpose("block", "band").values)
 
 
 def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:

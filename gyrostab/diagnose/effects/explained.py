@@ -9,14 +9,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.cells import State, harmonic_sets, order_columns, pair_rows, power_column
+from gyrostab.diagnose.effects.cells import State, harmonic_sets, order_columns, pair_rows, power_column, witness_power
 from gyrostab.diagnose.effects.response import is_filter, straightened
 from gyrostab.diagnose.gains.gain import noise_columns
 from gyrostab.diagnose.gains.lines import line_skirt
-from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.phase import fold
 
-__all__ = ["Part", "explain_away", "mean_columns", "odd_blocks", "reweighted", "take_part", "without_turns"]
+__all__ = ["Part", "explain_away", "mean_columns", "mirrored", "odd_blocks", "reweighted", "take_part", "without_turns"]
 
 Array = NDArray[np.float64]
 _LINE_REACH = 3  # lines on each side of one that belong to it
@@ -46,6 +45,11 @@ class Part:
     row: tuple[str, ...]
     gain: float
     place: int = -1
+
+
+def mirrored(part: Part) -> bool:
+    """Whether the axes see what turns in the other order: y stands at -90 degrees from x, or the channel runs back."""
+    return part.candidate.view == "order" and not part.candidate.each and part.place % 2 == 1
 
 
 def explain_away(state: State, parts: list[Part]) -> State:
@@ -139,7 +143,7 @@ def _order(state: State, part: Part) -> State:
         patterns = [(axis, np.ones(count, np.complex128)) for axis in part.row]
     else:
         chosen = (0,)
-        pattern = part.variant.design[0]
+        pattern = np.conj(part.variant.design[0]) if mirrored(part) else part.variant.design[0]
         patterns = [(axis, pattern[state.axes.index(axis)]) for axis in part.row]
     for axis, pattern in patterns:
         state = state.with_columns("order", axis, order_columns(pattern, chosen))
@@ -184,12 +188,8 @@ def _comb(state: State) -> NDArray[np.bool_]:
 
 
 def _transfer(state: State, part: Part) -> State:
-    axis, name = part.row[0], part.candidate.witness[0]
-    if name in state.axes:
-        power = measured(state.reduced, "power").sel(axis=name).transpose("block", "band").values
-    else:
-        place = [str(one) for one in state.reduced["witness"].values].index(name)
-        power = state.reduced["witness_power"].transpose("witness", "block", "band").values[place]
+    axis = part.row[0]
+    power = witness_power(part.candidate.witness[0], state.reduced)
     power = np.where(np.isfinite(power), power, 0.0)
     columns = np.concatenate(
         [part.variant.design.real * np.sqrt(power)[:, None], part.variant.design.imag * np.sqrt(power)[:, None]], axis=-1

@@ -13,13 +13,12 @@ from gyrostab.diagnose.calibration.baseline import DRAWS, assemble, drivers_of
 from gyrostab.diagnose.calibration.expected import common_variance, noise_powers, white_variance
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior
 from gyrostab.diagnose.effects.candidates import variants_of, windows_of
-from gyrostab.diagnose.effects.cells import State, begin_state, effective
+from gyrostab.diagnose.effects.cells import State, begin_state, effective, witness_power
 from gyrostab.diagnose.effects.explained import Part, explain_away, odd_blocks, take_part
 from gyrostab.diagnose.effects.response import is_filter, response_of
 from gyrostab.diagnose.effects.sizes import part_mixture
 from gyrostab.diagnose.modelling.refit import FORM_ERROR, Fitted
 from gyrostab.diagnose.naming.claims import Naming
-from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.base import Effect
 from gyrostab.physics.phase import fold
 
@@ -172,15 +171,9 @@ def _add(out: _Seen, part: Part, naming: Naming, baseline: xr.Dataset, axis: str
 
 def _followed(part: Part, state: State) -> Array:
     """Power that follows a channel or another axis, (block, band)."""
-    name = part.candidate.witness[0]
-    if name in state.axes:
-        power = measured(state.reduced, "power").sel(axis=name).transpose("block", "band").values
-    else:
-        place = [str(one) for one in state.reduced["witness"].values].index(name)
-        power = state.reduced["witness_power"].transpose("witness", "block", "band").values[place]
     mean, _ = part_mixture(part, state).moments()
     transfer = np.tensordot(mean, part.variant.design, axes=1)
-    return np.asarray(np.abs(transfer) ** 2 * np.nan_to_num(power))
+    return np.asarray(np.abs(transfer) ** 2 * np.nan_to_num(witness_power(part.candidate.witness[0], state.reduced)))
 
 
 def _comb(part: Part, state: State) -> Array:
@@ -210,7 +203,7 @@ def _said(effect: Effect, reduced: xr.Dataset, axis: str) -> Array:
             size = size[effect.axes.index(axis)] if len(size) > 1 else size[0]
         rows = np.asarray(density)
         out = out + float(size) ** 2 * (rows[0] if rows.ndim == 3 else rows)
-    return effective(out[None], reduced.sel(axis=[axis]))[0]
+    return np.asarray(effective(out[None], reduced.sel(axis=[axis]))[0])
 
 
 def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -> Posterior | None:

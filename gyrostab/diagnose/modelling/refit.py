@@ -1,4 +1,4 @@
-"""Fit all named effects together: values with honest errors, the model with the effects in it, and limits for what was not found."""
+"""Fit all named effects together: values with honest errors, and the model with the effects in it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.effects.candidates import Candidate, Variant
+from gyrostab.diagnose.effects.candidates import Variant
 from gyrostab.diagnose.effects.cells import State, begin_state, pair_rows
-from gyrostab.diagnose.effects.explained import Part, explain_away, mean_columns
+from gyrostab.diagnose.effects.explained import Part, explain_away, mirrored
 from gyrostab.diagnose.effects.response import is_filter
 from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
-from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.naming.filters import filter_sizes
 from gyrostab.diagnose.naming.name import AMBIGUOUS, Claim, Naming
 from gyrostab.diagnose.naming.odd import line_size, mark_sizes
@@ -24,15 +23,14 @@ from gyrostab.diagnose.naming.plainer import plainer
 from gyrostab.errors import GyrostabError
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
+from gyrostab.physics.rotation import EarthRate
 
-__all__ = ["FORM_ERROR", "Estimate", "Fitted", "Limit", "fit_claims", "limits", "predicted"]
+__all__ = ["FORM_ERROR", "Estimate", "Fitted", "fit_claims"]
 
 Array = NDArray[np.float64]
 #: Error of the form of an effect, as a share of its size: no effect is exactly what its equation says.
 FORM_ERROR = 0.04
 _TWO_SIDED = 1.959964
-_ONE_SIDED = 1.644854
-_DRAWS = 2000
 
 
 @dataclass(frozen=True)
@@ -82,15 +80,6 @@ class Fitted:
             return f"{effects()[self.claim.effect].short} (on {', '.join(self.axes)})."
         said = self.effect.say({name: one.stderr for name, one in self.parameters.items()})
         return f"{said} {self.note}" if self.note else said
-
-
-@dataclass(frozen=True)
-class Limit:
-    """An effect that was not found: how large it may be, at 95 %; NaN where the record cannot tell."""
-
-    upper_limit: float
-    unit: str
-    reason: str
 
 
 def fit_claims(naming: Naming, baseline: xr.Dataset) -> list[Fitted]:
@@ -177,11 +166,12 @@ def _words(claim: Claim, part: Part, state: State) -> dict[str, Any]:
         low, high = (float(state.reduced["ramp_turns"].attrs[name]) for name in ("low", "high"))
         return {"phase": "channel", "full": float(part.variant.values.get("full", 1.0)) * (high - low)}
     if claim.effect == "held_samples":
-        return {"fill": "zero" if part.variant.columns[0] == "zeros" else "repeat"}
+        return {"fill": "zero" if part.variant.columns[0] == "filled" else "repeat"}
     if claim.effect == "spikes":
         return {"kind": "outlier"}
-    if claim.effect == "real_motion" and part.candidate.view == "line":
-        return {}
+    if claim.effect == "earth_rate" and mirrored(part):
+        off, around = np.degrees(EarthRate.example().directions(claim.axes))
+        return {"off": list(off), "around": list(-around)}
     return {}
 
 
@@ -350,54 +340,3 @@ def _odd(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming)
 
 
 _SIZES = {"cross": _common, "order": _turning, "line": _line, "marks": _odd}
-
-
-# --------------------------------------------------------------------------------------------------------------- limits
-
-
-def limits(naming: Naming) -> dict[str, Limit]:
-    """How large every effect that was not named may be.
-
-    Returns
-    -------
-    dict of str to Limit
-        95 % limit of the effect's first size, the largest over axes; of effects in means and powers.
-    """
-    named = {claim.effect for claim in naming.claims}
-    out = {}
-    for name, kind in effects().items():
-        if name in named:
-            continue
-        unit = next((item.unit for item in kind.parameters() if item.name in kind.size_parameters), "1")
-        if name in naming.reasons:
-            out[name] = Limit(math.nan, unit, naming.reasons[name])
-            continue
-        found = [_limit(one, naming.state) for one in naming.candidates if one.effect == name and one.view in ("mean", "power", "cross")]
-        known = [(value, column) for value, column in found if math.isfinite(value)]
-        if not known:
-            out[name] = Limit(math.nan, unit, "not identifiable: free noise does as much" if found else "below limit")
-            continue
-        value, column = max(known)
-        unit = next((item.unit for item in kind.parameters() if item.name == column), unit)
-        out[name] = Limit(value, unit, "below limit")
-    return out
-
-
-def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
-    """Limit of the first parameter at the middle of its nuisance grid, largest over the rows."""
-    if not candidate.variants[0].columns:
-        return math.nan, ""
-    first = [one for one in candidate.variants if one.columns == candidate.variants[0].columns]
-    variant = first[len(first) // 2]
-    rows = pair_rows(state.reduced) if candidate.view == "cross" else [(axis,) for axis in state.axes]
-    worst = -math.inf
-    for row in rows:
-        number = state.axes.index(row[0])
-        if candidate.view == "mean" and not np.ptp(mean_columns(variant, number)[0]) > 0.0:
-            continue
-        mean, covariance = part_mixture(Part(candidate, variant, row, 0.0), state).moments()
-        value, sd = float(mean[0]), math.sqrt(max(float(covariance[0, 0]), 0.0))
-        if not math.isfinite(sd):
-            continue
-        worst = max(worst, math.sqrt(max(value, 0.0) + _ONE_SIDED * sd) if variant.squared else abs(value) + _ONE_SIDED * sd)
-    return (worst if worst > -math.inf else math.nan), variant.columns[0]
