@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gyrostab.clock import time_of_day
 from gyrostab.errors import FormatError, SchemaError
-from gyrostab.schema import check_log, check_product, check_surface
+from gyrostab.schema import check_log, check_product, check_surface, texts
 from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import ON_DISK, on_disk
 
@@ -188,13 +188,12 @@ def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, A
     except metadata.PackageNotFoundError:
         version = "unknown"
     given = dict(dataset.attrs)
-    files = given.get("source_files", ())
     history = given.get("history", "")
     lines = [history] if isinstance(history, str) else [str(line) for line in history]
     given["history"] = "\n".join([*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"])
     if given.get("title") in (None, *TITLES.values()):  # a title of ours may stem from an earlier stage
         given["title"] = TITLES[kind]
-    names = [files] if isinstance(files, str) else [str(name) for name in files]
+    names = texts(dataset, "source_files")
     source = "gyro log: " + ", ".join(names) if names else "gyro log"
     given.setdefault("source", source.encode("ascii", "backslashreplace").decode())
     given |= {"Conventions": CONVENTIONS, "date_created": now, "gyrostab_version": version, "gyrostab_content": kind}

@@ -31,7 +31,7 @@ import xarray as xr
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
-from gyrostab.schema import OBSERVABLE, check_product
+from gyrostab.schema import OBSERVABLE, check_product, texts
 
 __all__ = ["KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]
 
@@ -126,11 +126,10 @@ def to_kalibr(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
     rate = product.attrs.get("sampling_rate_hz")
     if rate is None:
         raise SchemaError("the product has no attribute 'sampling_rate_hz', which is Kalibr's update_rate; give it one in Hz")
-    files = product.attrs.get("source_files", [])
-    names = [files] if isinstance(files, str) else list(files)
+    names = [Path(name).name for name in texts(product, "source_files")]
     lines = [
         "# Noise of a gyro for Kalibr: medians over the windows of a dynamic Allan variance, made by gyrostab",
-        f"# from {', '.join(Path(name).name for name in names) or 'a log'}. At the top the worst axis, below each of them.",
+        f"# from {', '.join(names) or 'a log'}. At the top the worst axis, below each of them.",
         "# Kalibr also asks for rostopic, accelerometer_noise_density and accelerometer_random_walk: a gyro log does not tell them.",
         f"update_rate: {float(rate)!r}  # Hz",
     ]

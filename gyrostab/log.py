@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from gyrostab.errors import OptionError
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.timegrid import time_coordinate
+from gyrostab.timegrid import stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
 
 __all__ = ["make_log"]
@@ -79,7 +78,7 @@ def make_log(
         raise OptionError(f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, time) and one name per axis")
     if parsed.factor != 1.0:
         data = data * parsed.factor
-    coordinates = time_coordinate(int(pd.Timestamp(start).as_unit("ns").value), rate, data.shape[1])
+    coordinates = time_coordinate(stamp_ns(start), rate, data.shape[1])
     attrs = {"units": SIGNAL_UNITS[kind], "long_name": "rotation rate" if kind == "rate" else "angle"}
     log = xr.Dataset(
         {kind: (("axis", "time"), data, attrs, packing)},

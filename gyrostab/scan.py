@@ -76,7 +76,7 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
 def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.read import ReadOptions, read_log, scan_file
     from gyrostab.regularise import gap_table, regularise
-    from gyrostab.schema import log_channels, signal_name
+    from gyrostab.schema import log_channels, signal_name, texts
 
     max_gap = reading.get("max_gap", "10D")
     reading = {name: value for name, value in reading.items() if name not in ("max_gap", "on_file")}
@@ -87,7 +87,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
     gaps = gap_table(log)
     signal = log[signal_name(log)]
-    notes = dict.fromkeys(note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *log.attrs.get("notes", [])])
+    notes = dict.fromkeys(note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *texts(log, "notes")])
     return {
         "file": str(path),
         "format": summary.format,

@@ -33,6 +33,7 @@ __all__ = [
     "check_surface",
     "log_channels",
     "signal_name",
+    "texts",
 ]
 
 #: Flag values of ``gap_cause(gap)``, in the order of their numbers.
@@ -117,6 +118,18 @@ def signal_name(log: xr.Dataset) -> str:
         holds = ", ".join(found or sorted(map(str, log.data_vars))) or "nothing"
         raise SchemaError(f"a log holds either 'rate' or 'angle'; this dataset holds {holds}; make one with gyrostab.make_log")
     return found[0]
+
+
+def texts(dataset: xr.Dataset, name: str) -> list[str]:
+    """The texts of an attribute such as ``notes`` or ``source_files``; a single one may stand there without a list.
+
+    Examples
+    --------
+    >>> texts(xr.Dataset(attrs={"notes": "one"}), "notes"), texts(xr.Dataset(), "notes")
+    (['one'], [])
+    """
+    held = dataset.attrs.get(name, ())
+    return [held] if isinstance(held, str) else [str(text) for text in held]
 
 
 def log_channels(log: xr.Dataset) -> list[str]:

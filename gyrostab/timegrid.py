@@ -19,9 +19,40 @@ from numpy.typing import NDArray
 from xarray.core.indexing import IndexSelResult
 from xarray.indexes import CoordinateTransform, CoordinateTransformIndex
 
-__all__ = ["TimeGridIndex", "first_stamp", "grid_index", "grid_times", "period_ns", "time_coordinate"]
+from gyrostab.errors import OptionError
+
+__all__ = ["TimeGridIndex", "first_stamp", "grid_index", "grid_times", "period_ns", "stamp_ns", "time_coordinate"]
 
 NANOSECONDS = 10**9
+
+
+def stamp_ns(start: Any, what: str = "start") -> int:
+    """Nanoseconds since 1970 of an instant that a user gives as text (ISO 8601, UTC unless it says otherwise), or as such a number.
+
+    Parameters
+    ----------
+    start : str or int
+        The instant.
+    what : str
+        What it is, for the message.
+
+    Raises
+    ------
+    OptionError
+        When it is not a date and time.
+
+    Examples
+    --------
+    >>> stamp_ns("1970-01-01T02:00:01+02:00")
+    1000000000
+    """
+    if isinstance(start, int | np.integer):
+        return int(start)
+    try:
+        time = pd.Timestamp(start)
+        return int((time.tz_convert(None) if time.tzinfo else time).as_unit("ns").value)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise OptionError(f"{what} {start!r} is not a date and time; write for instance 2026-11-20T14:00:00 (UTC)") from error
 
 
 def period_ns(rate: float) -> tuple[int, float]:

@@ -19,7 +19,7 @@ from gyrostab.join.grid import Piece, Source, log_span, source_of
 from gyrostab.join.lazy import chunk_of, lay
 from gyrostab.join.notes import some, together
 from gyrostab.join.place import place_logs
-from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
+from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
 from gyrostab.store import common_packing
 from gyrostab.timegrid import grid_times, time_coordinate
 from gyrostab.windows import duration_seconds
@@ -137,12 +137,11 @@ def _absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
 def _attributes(sources: Sequence[Source], size: int, notes: Sequence[str]) -> dict[str, Any]:
     first = sources[0].log.attrs
     kept = {key: value for key, value in first.items() if all(_equal(source.log.attrs.get(key), value) for source in sources)}
-    files = [[names] if isinstance(names := source.log.attrs.get("source_files", []), str) else list(names) for source in sources]
-    said = [[note] if isinstance(note := source.log.attrs.get("notes", []), str) else list(note) for source in sources]
+    files, said = ([texts(source.log, name) for source in sources] for name in ("source_files", "notes"))
     labels = [names[0] if len(names) == 1 else source.name for names, source in zip(files, sources, strict=True)]
     now = time_of_day()
     done = f"{now} gyrostab.read_log: {len(sources)} regular logs on {size} samples at {sources[0].rate:.10g} Hz"
-    lost = [name for source in sources for name in source.log.attrs.get("unreadable_files", [])]
+    lost = [name for source in sources for name in texts(source.log, "unreadable_files")]
     return {
         **kept,
         "kind": signal_name(sources[0].log),

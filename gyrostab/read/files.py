@@ -20,6 +20,7 @@ from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
 from gyrostab.read.lost import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.overlap import stamp_span
+from gyrostab.schema import texts
 
 __all__ = ["OnFile", "Reader", "read_log", "readers", "scan_file"]
 
@@ -300,9 +301,8 @@ def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Datas
     idle = [f"--{option}" for option in ("start", "epoch", "map", "unit", "kind") if getattr(options, option)]
     if not idle or options.channel:
         return log
-    before = log.attrs.get("notes", [])
     note = f"{name}: is a regular log already, so {', '.join(idle)} is not used"
-    return log.assign_attrs(notes=[*([before] if isinstance(before, str) else before), note])
+    return log.assign_attrs(notes=[*texts(log, "notes"), note])
 
 
 def _check_options(parts: Sequence[xr.Dataset]) -> None:

@@ -14,6 +14,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.read.options import FileSummary
+from gyrostab.schema import texts
 
 __all__ = ["LostFile", "check_share", "is_damage", "lost_attributes", "lost_spans"]
 
@@ -137,8 +138,7 @@ def lost_attributes(log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Pa
             first, last = (str(np.datetime64(stamp, "ns").astype("datetime64[ms]")) for stamp in spans[one.path])
             where = f"its time is between {first} and {last}, which is a gap unless another file has it"
         notes.append(f"{one.reason}; the file is left out: {where}")
-    before = log.attrs.get("notes", [])
     return log.assign_attrs(
-        notes=[*([before] if isinstance(before, str) else before), *notes],
+        notes=[*texts(log, "notes"), *notes],
         unreadable_files=[*log.attrs.get("unreadable_files", []), *(one.path.name for one in lost)],
     )

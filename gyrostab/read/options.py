@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gyrostab.errors import OptionError
-from gyrostab.read.stamps import iso_to_ns
+from gyrostab.timegrid import stamp_ns
 
 __all__ = ["ColumnSummary", "FileSummary", "ReadOptions"]
 
@@ -69,7 +69,7 @@ class ReadOptions:
         for name in ("start", "epoch"):
             value = getattr(self, name)
             if value is not None:
-                iso_to_ns(value, what=f"--{name}")
+                stamp_ns(value, f"--{name}")
         for name in ("map", "unit"):
             object.__setattr__(self, name, dict(getattr(self, name) or {}))
         object.__setattr__(self, "channel", self.channel or ())
@@ -79,7 +79,7 @@ class ReadOptions:
     @property
     def epoch_ns(self) -> int:
         """Zero of numeric time [ns since 1970]."""
-        return 0 if self.epoch is None else iso_to_ns(self.epoch, what="--epoch")
+        return 0 if self.epoch is None else stamp_ns(self.epoch, "--epoch")
 
 
 @dataclass(frozen=True)

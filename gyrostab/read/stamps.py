@@ -12,9 +12,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyrostab.errors import OptionError, UnitError
+from gyrostab.errors import UnitError
+from gyrostab.timegrid import stamp_ns
 
-__all__ = ["NAT", "TimeUnit", "cells_to_ns", "floats_to_ns", "integers_to_ns", "iso_to_ns", "looks_iso", "parse_time_unit", "texts_to_ns"]
+__all__ = ["NAT", "TimeUnit", "cells_to_ns", "floats_to_ns", "integers_to_ns", "looks_iso", "parse_time_unit", "texts_to_ns"]
 
 #: The integer of ``NaT``.
 NAT = np.iinfo(np.int64).min
@@ -64,28 +65,12 @@ def parse_time_unit(text: str) -> TimeUnit:
     86400000000000
     """
     name, _, since = (part.strip() for part in text.strip().partition(" since "))
-    epoch = iso_to_ns(since, what=f"time unit {text!r}") if since else None
+    epoch = stamp_ns(since, f"time unit {text!r}") if since else None
     factor, _, bare = name.rpartition(" ")
     ns = _NANOSECONDS.get(bare.lower() if bare.lower() in _NANOSECONDS else bare)
     if ns is None or (factor and not _NUMBER.match(factor.strip())):
         raise UnitError(f"time unit {text!r} is not known; known are s, ms, us, ns, min, h, d, with a factor in front if needed")
     return TimeUnit(text, ns * Fraction(factor.strip() or "1"), epoch)
-
-
-def iso_to_ns(text: str, *, what: str) -> int:
-    """Stamp [ns since 1970] of an ISO 8601 text; UTC unless it says otherwise.
-
-    Examples
-    --------
-    >>> iso_to_ns("1970-01-01T00:00:01", what="--start")
-    1000000000
-    """
-    try:
-        stamp = pd.Timestamp(text)
-        stamp = stamp.tz_convert(None) if stamp.tzinfo else stamp
-        return int(stamp.as_unit("ns").value)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise OptionError(f"{what} {text!r} is not a time; write it as 2026-11-20T14:00:00 (UTC)") from error
 
 
 def looks_iso(text: str) -> bool:

@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from gyrostab.clock import time_of_day
@@ -24,9 +23,9 @@ from gyrostab.regularise.place import Placement, place_by_count, place_by_stamp,
 from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_near, estimate_rate, odd_stretches
 from gyrostab.regularise.repeats import find_repeats, with_repeats
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
-from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name
+from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name, texts
 from gyrostab.store import chunk_samples
-from gyrostab.timegrid import time_coordinate
+from gyrostab.timegrid import stamp_ns, time_coordinate
 from gyrostab.windows import duration_seconds
 
 __all__ = ["gap_table", "regularise"]
@@ -55,11 +54,7 @@ def _start(raw: xr.Dataset, notes: list[str]) -> int:
     if not text:
         notes.append(f"{file_of(raw)[0]}: no time in the file and no --start: the log is said to start at 1970-01-01T00:00:00")
         return 0
-    try:
-        stamp = pd.Timestamp(text)
-    except ValueError as error:
-        raise OptionError(f"start {text!r} is not a date and time; write for instance 2026-03-11T10:45:14") from error
-    return int((stamp.tz_convert(None) if stamp.tzinfo else stamp).as_unit("ns").value)
+    return stamp_ns(text)
 
 
 def _place(
@@ -136,8 +131,7 @@ def _attributes(raw: xr.Dataset, kind: str, rate: float, done: str, notes: list[
     kept = {key: value for key, value in raw.attrs.items() if key not in _OWN_ATTRIBUTES}
     now = time_of_day()
     history = "\n".join(filter(None, [raw.attrs.get("history"), f"{now} gyrostab.regularise: {done}"]))
-    before = raw.attrs.get("notes", [])
-    said = [*([before] if isinstance(before, str) else before), *notes]
+    said = [*texts(raw, "notes"), *notes]
     return {"source_files": [], **kept, "kind": kind, "sampling_rate_hz": rate, "history": history, "notes": said}
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.kernels.stamps import look
+from gyrostab.schema import texts
 from gyrostab.store.direct import stretch
 
 __all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
@@ -135,16 +136,14 @@ def blocks(
 
 
 def _sources(raw: xr.Dataset) -> str:
-    names = raw.attrs.get("source_files") or ["the raw log"]
-    return ", ".join(map(str, [names] if isinstance(names, str) else names))
+    return ", ".join(texts(raw, "source_files") or ["the raw log"])
 
 
 def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:
     """Name the source file that a row of the raw log comes from, and the row's number in it, counted from 0."""
-    names = raw.attrs.get("source_files") or ["the raw log"]
-    names = [names] if isinstance(names, str) else list(names)
+    names = texts(raw, "source_files") or ["the raw log"]
     starts = [int(start) for start in np.atleast_1d(raw.attrs.get("row_start", 0))]
     if len(starts) != len(names):
-        return ", ".join(map(str, names)), row
+        return ", ".join(names), row
     which = max(0, bisect_right(starts, row) - 1)
-    return str(names[which]), row - starts[which]
+    return names[which], row - starts[which]

@@ -13,7 +13,7 @@ from gyrostab.noise import LAWS
 from gyrostab.output import new_output
 from gyrostab.plot.style import duration, embedded
 from gyrostab.report.page import page_text
-from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_log, check_product
+from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_log, check_product, texts
 
 __all__ = ["write_report"]
 
@@ -105,7 +105,7 @@ def _missing(product: xr.Dataset) -> dict[str, float]:
 
 
 def _files(product: xr.Dataset) -> list[str]:
-    return [Path(name).name for name in _lines(product.attrs.get("source_files"))]
+    return [Path(name).name for name in texts(product, "source_files")]
 
 
 def _summary(product: xr.Dataset) -> str:

@@ -7,16 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.timegrid import time_coordinate
+from gyrostab.timegrid import stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
 from gyrostab.windows import duration_seconds
 
-__all__ = ["HELD", "Points", "channel", "check_points", "combine", "inner_unit", "piecewise", "stamp"]
+__all__ = ["HELD", "Points", "channel", "check_points", "combine", "inner_unit", "piecewise"]
 
 Array = NDArray[np.float64]
 #: Table of a profile: rows of a time [s] and what holds there.
@@ -24,17 +23,6 @@ Points = Sequence[Sequence[float]]
 #: Attribute of a channel whose values hold until the next one instead of running towards it.
 HELD = {"interpolation": "previous"}
 _EAGER = 2**20  # longer channels are computed chunk by chunk, when they are used
-
-
-def stamp(start: Any) -> int:
-    """Nanoseconds since 1970 of a time given as text, or as such a number."""
-    if isinstance(start, int | np.integer):
-        return int(start)
-    try:
-        time = pd.Timestamp(start)
-        return int((time.tz_convert(None) if time.tzinfo else time).as_unit("ns").value)
-    except (ValueError, TypeError) as error:
-        raise OptionError(f"start {start!r} is not a date and time; write for instance 2026-03-11T10:45:14") from error
 
 
 def inner_unit(unit: str, values: Any) -> tuple[str, Any]:
@@ -117,7 +105,7 @@ def channel(
     size = max(1, math.ceil(duration_seconds(duration, "duration") * sensor_rate - 1e-6))
     dim = f"time_{name}"
     attrs = {"units": unit, "long_name": name.replace("_", " "), **(attributes or {})}
-    coordinates = time_coordinate(stamp(start), sensor_rate, size, name=dim)
+    coordinates = time_coordinate(stamp_ns(start), sensor_rate, size, name=dim)
     return xr.Dataset({name: (dim, _sampled(values, size, sensor_rate), attrs)}, coords=coordinates)
 
 

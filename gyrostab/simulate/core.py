@@ -21,12 +21,12 @@ from gyrostab.noise import TERMS
 from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
 from gyrostab.schema import GAP_CAUSES, SIGNAL_UNITS, attributes, check_log, log_channels, signal_name
 from gyrostab.simulate.block import BlockState, Plan, Step, check_effects
-from gyrostab.simulate.channels import combine, stamp
+from gyrostab.simulate.channels import combine
 from gyrostab.simulate.drivers import make_source
 from gyrostab.simulate.lazy import lazy_rates
 from gyrostab.simulate.model import PROFILES, Model, read_model
 from gyrostab.simulate.noise import begin_noise, stream
-from gyrostab.timegrid import first_stamp, grid_index, time_coordinate
+from gyrostab.timegrid import first_stamp, grid_index, stamp_ns, time_coordinate
 from gyrostab.units import parse_unit
 from gyrostab.windows import duration_seconds
 
@@ -148,7 +148,7 @@ def _frame(model: Model, *, duration: Any, rate: float | None, start: Any, seed:
     size = round(duration_seconds(length, "duration") * hertz)
     if size < 1:
         raise OptionError(f"{model.source}: a duration of {length} is shorter than one sample at {hertz:g} Hz")
-    begin = stamp(start if start is not None else model.log.get("start", "1970-01-01"))
+    begin = stamp_ns(start if start is not None else model.log.get("start", "1970-01-01"))
     return _checked(model, _Frame(float(hertz), size, begin, chosen, model.axes or ("x", "y", "z"), factor))
 
 

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.simulate.channels import Points, check_points, stamp
+from gyrostab.simulate.channels import Points, check_points
 from gyrostab.simulate.noise import stream
+from gyrostab.timegrid import stamp_ns
 from gyrostab.windows import duration_seconds
 
 __all__ = ["gaps", "losses", "power_cuts"]
@@ -21,7 +22,7 @@ _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
 
 def _table(spans: NDArray[np.float64], cause: int, start: Any) -> xr.Dataset:
     """Gaps from seconds; they are cut to samples when the log is made."""
-    edges = stamp(start) + np.rint(spans.reshape(-1, 2) * 1e9).astype(np.int64)
+    edges = stamp_ns(start) + np.rint(spans.reshape(-1, 2) * 1e9).astype(np.int64)
     flags = {"flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8), "flag_meanings": " ".join(GAP_CAUSES)}
     return xr.Dataset(
         {
