@@ -10,9 +10,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.explained import Part, without_turns
+from gyrostab.diagnose.locating.locate import louder
 from gyrostab.diagnose.locating.null_scores import NullScores, standardise
 from gyrostab.diagnose.naming.name import Claim
 from gyrostab.diagnose.views import VIEWS
+from gyrostab.diagnose.views.restless import levelled
 
 __all__ = ["acting", "explanations", "spans"]
 
@@ -103,12 +105,12 @@ def explanations(
     list of list of str
         Names, for each mismatch.
     """
-    scores = _scores(reduced, after, null)
+    boxes = [{str(name): found[name].values[number] for name in found.data_vars} for number in range(found.sizes["mismatch"])]
+    scores = _scores(reduced, after, null, boxes)
     begin, end = reduced["begin"].values, reduced["end"].values
     when = [spans(acting(claim, begin.size), begin, end) for claim in claims]
     out = []
-    for number in range(found.sizes["mismatch"]):
-        box = {str(name): found[name].values[number] for name in found.data_vars}
+    for box in boxes:
         gone = _gone(box, scores, null, level)
         names = []
         for claim, its_time in zip(claims, when, strict=True):
@@ -142,7 +144,7 @@ def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
     if np.isfinite(box["frequency"]):
         return bool(abs(box["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine)
     tau = _BUMP / mine  # where the Allan variance of a sine is largest
-    return str(box["what"]) in ("avar", "level") and bool(box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE)
+    return str(box["what"]).startswith(("avar", "level", "restless")) and bool(box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE)
 
 
 def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
@@ -150,12 +152,15 @@ def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
     return bool(shared >= _MEETS * min(box["end"] - box["begin"], span[1] - span[0]))
 
 
-def _scores(reduced: xr.Dataset, after: xr.Dataset, null: NullScores) -> list[tuple[str, xr.Dataset, Array]]:
+def _scores(
+    reduced: xr.Dataset, after: xr.Dataset, null: NullScores, boxes: Sequence[Mapping[str, Any]]
+) -> list[tuple[str, xr.Dataset, Array]]:
     """Views of the recording against the baseline with the effects."""
     out = []
     turns_left_out = without_turns(reduced, after["spectrum"].transpose("axis", "block", "band").values)
+    special = {"distribution": turns_left_out, "restless": levelled(reduced, after, louder(boxes))}
     for name, score in VIEWS.items():
-        seen = turns_left_out if name == "distribution" else reduced
+        seen = special.get(name, reduced)
         scores = score(seen, after) if name in null.views else None
         if scores is not None:
             out.append((name, scores, standardise(scores, null.views[name])))

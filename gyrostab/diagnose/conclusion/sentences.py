@@ -220,6 +220,13 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
     sure = chance(box["p_value"])
     begin = axes[0].upper() + axes[1:]
     one, estimate = len(box["axes"]) == 1, box.get("estimate", np.nan)
+    if box["view"] == "davar" and str(box.get("what", "")).startswith("restless"):
+        pace = length_text(float(str(box["what"]).split()[1]))
+        size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
+        return (
+            f"The noise of {axes} goes up and down {when}, at {taus}: from one stretch of {pace} to another its power changes{size}, which "
+            f"is {box['ratio']:.3g} times the scatter of steady noise ({sure})."
+        )
     if box["view"] == "davar":
         what = "noisier" if more else "quieter"
         return (
@@ -245,6 +252,9 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
         )
     if box["view"] == "spectrum" and what == "ramp phase":
         return f"The rate of {axes} has a part of {estimate:.3g} deg/h rms that follows the phase of the feedback ramp {when} ({sure})."
+    if box["view"] == "spectrum" and what.startswith("glide"):
+        begins, ends = what.split()[1:]
+        return f"The spectrum of {axes} has a line that moves {when}, from about {begins} Hz to about {ends} Hz ({sure})."
     if box["view"] == "spectrum":
         return (
             f"The spectrum of {axes} has a line at {box.get('frequency', np.nan):.5g} Hz {when}, {box['ratio']:.3g} times the level "

@@ -11,6 +11,7 @@ Box = dict[str, Any]
 _LIKE = 0.5  # share of the time of both that two boxes have in common when they are one
 _NEAR = 0.25  # of the longer of two boxes, which may lie between them when they are one
 _LINE = 0.02  # share of the frequency by which one line may wander
+_KINDS = ("slow", "restless", "glide")
 _STEPS = 3  # boxes of one mean, beyond which it is said to wander
 
 
@@ -51,9 +52,15 @@ def _alike(one: Box, other: Box) -> bool:
         return False
     if one["what"] == "line" or other["what"] == "line":
         return bool(one["what"] == other["what"] and abs(one["frequency"] / other["frequency"] - 1.0) < _LINE)
-    if (one["what"] == "slow") != (other["what"] == "slow"):  # inside blocks, and from block to block
+    if _kind(one) != _kind(other):
         return False
     return bool(min(one["tau_max_s"], other["tau_max_s"]) >= 0.99 * max(one["tau_min_s"], other["tau_min_s"]))
+
+
+def _kind(box: Box) -> str:
+    """What is never one mismatch: inside of blocks and from one to the next, a level and its scatter, lines that stand and that move."""
+    kind = str(box["what"]).split(" ")[0]
+    return kind if kind in _KINDS else ""
 
 
 def _shared(one: Box, other: Box) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,10 @@ from gyrostab.diagnose.locating.boxes import merged, wandering
 from gyrostab.diagnose.locating.null_scores import NullScores, null_scores, standardise
 from gyrostab.diagnose.views import VIEWS
 from gyrostab.diagnose.views.mean import box_mean
+from gyrostab.diagnose.views.restless import levelled
 from gyrostab.errors import OptionError
 
-__all__ = ["FIELDS", "locate"]
+__all__ = ["FIELDS", "locate", "louder"]
 
 Array = NDArray[np.float64]
 _RAISED = 2.0  # of a piece that has a part in a mismatch
@@ -88,8 +89,15 @@ def locate(reduced: xr.Dataset, baseline: xr.Dataset, nulls: Iterable[xr.Dataset
         if name not in null.views:
             continue
         find = _mean_boxes if name == "mean" else _boxes
-        boxes += find(name, score, reduced, baseline, null, level)
+        seen = levelled(reduced, baseline, louder(boxes)) if name == "restless" else reduced
+        boxes += find(name, score, seen, baseline, null, level)
     return _table(merged(boxes)[:_TOLD], reduced, null, level)
+
+
+def louder(boxes: Iterable[Mapping[str, Any]]) -> list[tuple[list[str], float, float]]:
+    """Axes, begin and end [s] of the boxes that say how loud the noise is: to say that it changes would tell the same again."""
+    told = (box for box in boxes if box["view"] == "davar" and box["what"] in ("avar", "level"))
+    return [(str(box["axes"]).split(), float(box["begin"]), float(box["end"])) for box in told]
 
 
 def _boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import xarray as xr
 
-from gyrostab.diagnose.views import common, cross_axis, davar, distribution, locked, mean, restart, spectrum
+from gyrostab.diagnose.views import common, cross_axis, davar, distribution, gliding, locked, mean, restart, restless, spectrum
 
 __all__ = ["VIEWS"]
 
@@ -24,4 +24,6 @@ VIEWS: dict[str, Callable[[xr.Dataset, xr.Dataset], xr.Dataset | None]] = {
     "locked": locked.score,
     "distribution": distribution.score,
     "restart": restart.score,
+    "restless": restless.score,
+    "gliding": gliding.score,
 }
