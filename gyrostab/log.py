@@ -53,7 +53,7 @@ def make_log(
     Raises
     ------
     OptionError
-        When shape, rate or kind make no sense.
+        When shape, rate, start or kind make no sense.
     UnitError
         When the unit is unknown or does not fit `kind`.
 

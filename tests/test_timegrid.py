@@ -12,6 +12,8 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gyrostab.errors import OptionError
+from gyrostab.log import make_log
 from gyrostab.timegrid import TimeGridIndex, first_stamp, grid_index, grid_times, time_coordinate
 
 START = pd.Timestamp("2026-11-20T23:59:59.123456789").value
@@ -88,3 +90,13 @@ class TestIndex:
         np.testing.assert_array_equal(renamed.t.values, log.time.values)
         assert log.resample(time="1s").mean().sizes["time"] == 11
         assert log.to_dataframe().index[-1] == pd.Timestamp(log.time.values[-1])
+
+
+def test_a_start_that_is_no_time_is_refused():
+    with pytest.raises(OptionError, match="start 'soon' is not a date and time"):
+        make_log(np.zeros(3), rate=1.0, unit="deg/h", start="soon")
+
+
+def test_a_start_with_an_offset_is_utc_in_the_log():
+    log = make_log(np.zeros(3), rate=1.0, unit="deg/h", start="2026-01-01T02:00+02:00")
+    assert log["time"].values[0] == np.datetime64("2026-01-01T00:00")
