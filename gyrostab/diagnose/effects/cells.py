@@ -19,7 +19,7 @@ from gyrostab.diagnose.gains.gain import Cells, independent, noise_columns
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.kernels.periodogram import taper
 
-__all__ = ["State", "begin_state", "cells_of", "drawn", "effective", "in_place", "pair_rows", "view_rows", "witness_power"]
+__all__ = ["State", "begin_state", "cells_of", "cross_column", "drawn", "effective", "in_place", "pair_rows", "view_rows", "witness_power"]
 
 Array = NDArray[Any]
 
@@ -73,20 +73,23 @@ def drawn(cells: Cells, rng: np.random.Generator, count: int) -> Cells:
     return cells._replace(values=spread[..., None] * rng.standard_normal((*spread.shape, count)))
 
 
-def in_place(reduced: xr.Dataset) -> Array:
-    """Share of a density that the samples of each block show at its own frequencies, (axis, block): 1 without gaps.
+def in_place(reduced: xr.Dataset, row: str = "axis") -> Array:
+    """Share of a density that the samples of each block show at its own frequencies, (axis or pair, block): 1 without gaps.
 
     Random gaps spread the rest over all frequencies. That the tapered ends of a block have fewer neighbours spreads nothing.
     """
-    near = reduced["neighbours"].transpose("axis", "block").values
+    near = reduced["neighbours" if row == "axis" else "cross_neighbours"].transpose(row, "block").values
     weights = taper(int(reduced.attrs["block_samples"]))
     whole = float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())
     return np.minimum(np.where(np.isfinite(near), near, whole) / whole, 1.0)
 
 
-def effective(density: Array, reduced: xr.Dataset) -> Array:
-    """A density, (axis or 1, block or 1, band), as gaps let it be seen: mixed with its mean over frequency, (axis, block, band)."""
-    near = in_place(reduced)[..., None]
+def effective(density: Array, reduced: xr.Dataset, row: str = "axis") -> Array:
+    """A density, (axis or 1, block or 1, band), as gaps let it be seen: mixed with its mean over frequency, (axis, block, band).
+
+    The row may be a pair of axes in place of an axis.
+    """
+    near = in_place(reduced, row)[..., None]
     width = reduced["band_high"].values - reduced["band_low"].values
     level = (density * width).sum(axis=-1, keepdims=True) / width.sum()
     return np.asarray(near * density + (1.0 - near) * level)
@@ -141,11 +144,6 @@ def _spread(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
     return np.stack([np.broadcast_to(one, shape) for one in columns], axis=-1)
 
 
-def _row(design: Array, row: int) -> Array:
-    """The row of a column (axis or 1, ...)."""
-    return np.asarray(design[row] if design.shape[0] > 1 else design[0])
-
-
 # --------------------------------------------------------------------------------------------------------------- powers
 
 
@@ -172,17 +170,25 @@ def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
 # --------------------------------------------------------------------------------------------------------------- crosses
 
 
+def cross_column(density: Array, row: int, reduced: xr.Dataset) -> Array:
+    """A cross-density (1, block or 1, band) of a pair of axes as gaps let it be seen, complex (block, band)."""
+    shape = reduced["cross"].transpose("pair", "block", "band").shape
+    return np.asarray(np.broadcast_to(effective(density + 0j, reduced, "pair"), shape)[row])
+
+
 def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
     pair = pair_rows(state.reduced)[row]
     i, j = (state.axes.index(axis) for axis in pair)
     values = _records(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row]
-    shape = np.sqrt(state.reduced["shape"].values[i] * state.reduced["shape"].values[j])
+    shape = state.reduced["cross_shape"].transpose("pair", "block", "band").values[row]
     weight = 2.0 * shape / (state.weight[i] * state.weight[j])
     weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
     weight = np.concatenate([weight, weight], axis=1)
     given, precision = _beside(state, "cross", pair, weight.shape)
     designs = [
-        _spread([_parts(_row(one, row) + 0j) for one in variant.design], weight.shape) for each in candidates for variant in each.variants
+        _spread([_parts(cross_column(one, row, state.reduced)) for one in variant.design], weight.shape)
+        for each in candidates
+        for variant in each.variants
     ]
     return Cells(_parts(values, axis=1), weight, designs, given, precision)
 

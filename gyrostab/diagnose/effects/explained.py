@@ -9,10 +9,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.cells import State, harmonic_sets, order_columns, pair_rows, power_column, witness_power
+from gyrostab.diagnose.effects.cells import State, cross_column, harmonic_sets, order_columns, pair_rows, power_column, witness_power
 from gyrostab.diagnose.effects.response import is_filter, straightened
 from gyrostab.diagnose.gains.gain import noise_columns
-from gyrostab.diagnose.gains.lines import line_skirt
+from gyrostab.diagnose.gains.lines import expected_lines, line_skirt
 from gyrostab.physics.phase import fold
 
 __all__ = ["Part", "explain_away", "mean_columns", "mirrored", "odd_blocks", "reweighted", "take_part", "without_turns"]
@@ -101,7 +101,8 @@ def _power(state: State, part: Part) -> State:
     axis = part.row[0]
     row = state.axes.index(axis)
     if is_filter("power", part.variant) and "line_power" in state.reduced:
-        reduced, stopped = straightened(state.reduced, axis, part.candidate.effect, part.variant.values)
+        expected = expected_lines(state.baseline, state.reduced["line_frequency"].values)[row]
+        reduced, stopped = straightened(state.reduced, axis, part.candidate.effect, part.variant.values, expected)
         state = replace(state, reduced=reduced).with_columns("line", "all", [stopped])
     if is_filter("power", part.variant) and axis in state.baseline.attrs.get("recalibrated", ()):
         return state  # the noise of the baseline is filtered already
@@ -112,7 +113,7 @@ def _cross(state: State, part: Part) -> State:
     row = pair_rows(state.reduced).index(part.row)
     columns = []
     for one in part.variant.design:
-        chosen = np.asarray(one[row] if one.shape[0] > 1 else one[0]) + 0j
+        chosen = cross_column(one, row, state.reduced)
         columns.append(np.concatenate([chosen.real, chosen.imag], axis=-1))
     return state.with_columns("cross", ",".join(part.row), columns)
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.effects.cells import State, begin_state, pair_rows
+from gyrostab.diagnose.effects.cells import State, begin_state, cross_column, pair_rows
 from gyrostab.diagnose.effects.explained import Part, explain_away
 from gyrostab.diagnose.effects.sizes import mean_mixture, part_mixture
 from gyrostab.diagnose.naming.claims import Naming
@@ -68,5 +68,5 @@ def _shared(parts: Sequence[Part], state: State, naming: Naming) -> NDArray[np.c
         alone = replace(state, given={key: value for key, value in state.given.items() if key[0] != "cross"})
         mean, _ = part_mixture(part, alone).moments()
         for size, design in zip(mean, part.variant.design, strict=True):
-            total[row] += size * np.broadcast_to(design[row] if design.shape[0] > 1 else design[0], shape)
+            total[row] += size * cross_column(design, row, state.reduced)
     return total

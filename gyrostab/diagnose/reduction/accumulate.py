@@ -59,6 +59,7 @@ class Accumulator:
         self.pairs = [(a, b) for a, b in combinations(range(rows), 2) if a < self.axes]
         self.cross = np.full((len(self.pairs), blocks, bands), np.nan + 0j)
         self.cross_shape = np.full(self.cross.shape, np.nan)
+        self.cross_neighbours = np.full(self.cross.shape[:2], np.nan)
         self.line_sum = np.zeros((self.axes, PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, PARTS, 2))
@@ -137,9 +138,11 @@ class Accumulator:
             differ = (both != counts[a]) | (both != counts[b])
             differ &= used[a] & used[b]
             self.cross_shape[number, part] = self.shape[a, part]
+            self.cross_neighbours[number, part] = self.neighbours[a, part]
             if differ.any():
                 both_there = (present[a] & present[b])[differ]
                 cross[differ], self.cross_shape[number, part][differ] = self._jointly(centred[[a, b]][:, differ], both_there)
+                self.cross_neighbours[number, part][differ] = _neighbours(both_there, self.weights)
             cross[~(used[a] & used[b])] = np.nan
             cross[both < max(_POWER_SHARE * self.length, 2)] = np.nan
             self.cross[number, part] = cross
@@ -232,7 +235,8 @@ def _swap(found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
 
 def _neighbours(present: NDArray[np.bool_], weights: Array) -> Array:
     tapered = present * weights
-    return np.asarray((tapered[:, 1:] * tapered[:, :-1]).sum(axis=-1) / (tapered**2).sum(axis=-1))
+    with np.errstate(invalid="ignore"):
+        return np.asarray((tapered[:, 1:] * tapered[:, :-1]).sum(axis=-1) / (tapered**2).sum(axis=-1))
 
 
 def _turning(log: xr.Dataset) -> tuple[Source | None, float]:

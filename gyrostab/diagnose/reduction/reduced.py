@@ -108,6 +108,7 @@ def reduce_log(
         By ``(axis, block)``: ``mean`` [degree hour-1], ``samples``, ``neighbours``, ``adjacent``, ``kurtosis``, ``outliers``,
         ``repeats``, ``extremes``, ``zeros``, and of these ``stuck`` and ``filled``. By ``(axis, block, band)``: ``power``
         [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band),
+        ``cross_neighbours(pair, block)``,
         ``witness_power``, ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
         ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects
         follow late, and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz]
@@ -227,6 +228,8 @@ def _beside(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     found["cross"] = (("pair", "block", "band"), work.cross[own], attrs)
     attrs = _named("shape of the gamma distribution of powers over the samples that both axes have", "1")
     found["cross_shape"] = (("pair", "block", "band"), work.cross_shape[own], attrs)
+    attrs = _named("share of neighbouring pairs of the samples that both axes have, tapered", "1")
+    found["cross_neighbours"] = (("pair", "block"), work.cross_neighbours[own], attrs)
     found["first"] = ("pair", np.array([names[work.pairs[number][0]] for number in own], dtype=object))
     found["second"] = ("pair", np.array([names[work.pairs[number][1]] for number in own], dtype=object))
     if work.beside:

@@ -1,0 +1,37 @@
+"""What axes share, seen through gaps of their own or of both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.sizes import part_mixture
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.simulate import simulate
+
+
+@pytest.fixture(scope="module")
+def log():
+    model = {"log": {"axes": ["x", "y"]}, "noise": {"N": 0.003}, "effect": [{"name": "shared_source", "N": 0.003, "bandwidth": 0.5}]}
+    return simulate(model, duration="30min", rate=10.0, seed=5).compute()
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_random_gaps_do_not_make_a_shared_band_smaller(log, rows):
+    lost = np.random.default_rng(3).random((rows, log.sizes["time"])) < 0.4
+    there = xr.DataArray(np.broadcast_to(~lost, (2, lost.shape[1])), dims=("axis", "time"))
+    rate = log["rate"].transpose("axis", "time")
+    reduced = reduce_log(log.assign(rate=rate.where(there).assign_attrs(rate.attrs)))
+    baseline = calibrate(reduced)
+    known, _ = effect_candidates(reduced, baseline["coefficient"])
+    one = next(one for one in known if one.effect == "shared_source" and one.view == "cross")
+    variant = next(each for each in one.variants if each.values["bandwidth"] == 0.5)
+    mean, covariance = part_mixture(Part(one, variant, ("x", "y"), 1.0), begin_state(reduced, baseline)).moments()
+    error = float(np.sqrt(covariance[0, 0]))
+    assert abs(mean[0] - 9e-6) < 3.0 * error
+    assert error < 0.1 * mean[0]
