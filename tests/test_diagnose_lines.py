@@ -10,6 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.effects.designs import Candidate, Variant
 from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.response import straightened
 from gyrostab.diagnose.gains.lines import line_gains, line_skirt
 from gyrostab.diagnose.naming.claims import Claim, form_error, with_claim
 from gyrostab.diagnose.naming.name import name_effects
@@ -137,3 +138,27 @@ def test_the_spectrum_of_driven_noise_may_leave_a_filter_but_no_other_noise() ->
         (steady, "logger_filter", 2.0),
     ):
         assert form_error([part(effect, "power", 17.0)], [chosen], share=0.01) == pytest.approx(error)
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])
+def test_a_spectrum_is_straightened_by_as_much_as_its_filter_takes(weight: float) -> None:
+    """Weights of 1 - a and a take 4 a (1 - a) of what a mean of two takes; a line stays in, and no slope is left that looks like one."""
+    rng = np.random.default_rng(8)
+    raw = rng.standard_normal(60_001) + 0.15 * np.sin(2.0 * np.pi * 4.0 * np.arange(60_001) / 10.0)
+    record = reduce_log(make_log(((1.0 - weight) * raw[1:] + weight * raw[:-1])[None], rate=10.0, unit="deg/h"))
+    lines = record["line_frequency"].values
+    mean_of_two = {"cutoff": 0.0, "order": 2.0, "length": 0.2, "pick": 0.0, "instrument": 1.0}
+    found, stopped = straightened(record, "x", "logger_filter", mean_of_two, np.ones(lines.size))
+    power = found["line_power"].mean("part").values[0] * 10.0
+    near = np.abs(lines - 4.0) < 0.2
+    kept = ~near & ~stopped
+    slope, level = np.polyfit(lines[kept], power[kept], 1)
+    assert level == pytest.approx(1.0, abs=0.05)
+    assert slope * 5.0 == pytest.approx(0.0, abs=0.13)
+    assert stopped.any() == (weight == 0.5)
+    gains = line_gains(found["line_power"].values[None], found["line_weight"].values)[0, 0]
+    assert lines[gains.argmax()] == pytest.approx(4.0, abs=0.1)
+    assert gains.max() > 20.0
+    assert np.where(near | stopped, -np.inf, gains).max() < 5.0
+    again, _ = straightened(found, "x", "logger_filter", mean_of_two, np.ones(lines.size))
+    xr.testing.assert_identical(again, found)

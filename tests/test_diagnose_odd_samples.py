@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_limits
 
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.modelling.refit import fit_claims
@@ -15,14 +14,9 @@ from gyrostab.physics.registry import make_effect
 from tests.effect_bench import run
 from tests.named import nulls
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SCATTER = 0.5  # deg/h, of a sample
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """As `gyrostab.diagnose` has it."""
-    with threadpool_limits(1, user_api="blas"):
-        yield
 
 
 def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -> Naming:

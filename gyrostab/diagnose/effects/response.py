@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.candidates import Variant, windows_of
+from gyrostab.diagnose.gains.lines import local_level
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 
@@ -18,7 +19,18 @@ __all__ = ["is_filter", "response_of", "straightened"]
 
 Array = NDArray[np.float64]
 _INSIDE = 24  # frequencies in a band
+_SHARES, _PASSED = 50, 0.002  # sizes that are tried; least share that a filter of full form lets pass by
+_LOUD = 3.0  # times the level about, beyond which a line is cut
 _STOPPED = 0.05  # of the largest response, below which what is seen is leakage from elsewhere
+
+
+def _share(power: Array, full: Array) -> float:
+    """Share of what a filter takes at its full size, by the likelihood of powers over those without it, whatever their level."""
+    usual = np.minimum(power, _LOUD * local_level(power[None])[0])  # a line is no part of the form
+    passed = full >= _STOPPED * full.max()
+    shares = 1.0 - np.append(np.geomspace(1.0, _PASSED, _SHARES), 0.0)
+    form = 1.0 + shares[:, None] * (full[passed] - 1.0)
+    return float(shares[np.argmin(np.log((usual[passed] / form).mean(axis=1)) + np.log(form).mean(axis=1))])
 
 
 def is_filter(view: str, variant: Variant) -> bool:
@@ -39,15 +51,35 @@ def _response(effect: Effect, reduced: xr.Dataset, frequency: Array) -> Array:
     return np.ones(frequency.size) if found is None else np.asarray(found)
 
 
-def straightened(reduced: xr.Dataset, axis: str, effect: str, values: Mapping[str, Any]) -> tuple[xr.Dataset, NDArray[np.bool_]]:
-    """The record with the line spectrum of an axis as it was before a filter, once only; and the lines that the filter stops."""
+def straightened(
+    reduced: xr.Dataset, axis: str, effect: str, values: Mapping[str, Any], expected: Array
+) -> tuple[xr.Dataset, NDArray[np.bool_]]:
+    """The record with the line spectrum of an axis as it was before a filter, once only; and the lines that the filter stops.
+
+    A filter is named by the form of what it takes, of any size: a weak one is straightened by as much as the spectrum asks for.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+    axis : str
+    effect : str
+    values : mapping
+        Of the filter at its full size.
+    expected : ndarray, shape (line,)
+        Density without it, but for a factor.
+    """
     frequency = reduced["line_frequency"].values
-    response = _response(effects()[effect].example(**values), reduced, frequency)
+    full = _response(effects()[effect].example(**values), reduced, frequency)
+    weight, power = reduced["line_weight"].sel(axis=axis).values, reduced["line_power"].sel(axis=axis).transpose("part", "line").values
+    good = (weight > 0) & np.isfinite(power).all(axis=1)
+    response = full
+    if good.any():
+        response = 1.0 + _share(np.average(power[good], axis=0, weights=weight[good]) / np.maximum(expected, 1e-300), full) * (full - 1.0)
     stopped = response < _STOPPED * response.max()
     done = str(reduced.attrs.get("straightened", "")).split()
     if axis in done:
         return reduced, stopped
     here = reduced["axis"] == axis
     factor = xr.DataArray(np.maximum(response, _STOPPED * response.max()), dims="line")
-    power = reduced["line_power"]
-    return reduced.assign(line_power=power.where(~here, power / factor)).assign_attrs(straightened=" ".join([*done, axis])), stopped
+    before = reduced["line_power"]
+    return reduced.assign(line_power=before.where(~here, before / factor)).assign_attrs(straightened=" ".join([*done, axis])), stopped
