@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 
 from gyrostab.diagnose.conclusion.sentences import mismatch_statement
 from gyrostab.diagnose.locating.boxes import merged
+from gyrostab.diagnose.locating.ensemble import _leaked
 from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import null_scores, standardise
 from gyrostab.diagnose.views import gliding, restless, spectrum
+from gyrostab.kernels.periodogram import taper
 from tests.reduced_records import baseline, chunks, records
 
 SMALL = {"rate": 10.0, "blocks": 120}
@@ -214,3 +216,18 @@ def test_sentences_say_how_fast_and_where_to():
     assert "8 % (rms)" in told
     glide = box | {"view": "spectrum", "what": "glide 1.58 3.42", "axes": ["y"]}
     assert "a line that moves over the whole record, from about 1.58 Hz to about 3.42 Hz" in mismatch_statement(glide, 2000.0)
+
+
+def test_drawn_lines_leak_as_those_of_tapered_noise_do():
+    rng, size = np.random.default_rng(2), 200
+    lines = np.abs(np.fft.rfft(rng.normal(size=(40_000, size)) * taper(size), axis=-1)[:, 1:100]) ** 2
+    drawn = _leaked(rng.gamma(12.0, size=(40_000, 99)) / 12.0, size)
+    for wide in (4, 15, 40):  # lines that a way adds up
+        spread = [one[:, 20 : 20 + wide].mean(axis=1).std() / one.mean() for one in (lines, drawn)]
+        alone = [one[:, 20:60].std() / one.mean() for one in (lines, drawn)]
+        seen, wanted = (sums / single * np.sqrt(wide) for sums, single in zip(spread, alone, strict=True))
+        assert wanted == pytest.approx(seen, abs=0.015)
+    assert seen > 1.02
+    assert drawn.min() > 0.0
+    assert drawn.mean() == pytest.approx(1.0, abs=1e-3)
+    assert drawn.var() == pytest.approx(1.0 / 12.0, rel=0.02)

@@ -16,6 +16,7 @@ from scipy.special import ndtr
 
 from gyrostab.diagnose.calibration.expected import line_columns, white_variance
 from gyrostab.diagnose.reduction.outliers import beyond_chance
+from gyrostab.kernels.periodogram import taper
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times
 from gyrostab.noise import HOUR
 
@@ -193,7 +194,17 @@ def _lines(frame: _Frame, squares: Array, rng: np.random.Generator) -> Array:
         share = near[axis, chosen].mean()
         effects = np.interp(frequency, bands, frame.effects[axis, chosen].mean(axis=0))
         out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
-    return _gamma(weight[..., None], out, rng)
+    return _leaked(_gamma(weight[..., None], np.ones(out.shape), rng), int(reduced.attrs["block_samples"])) * out
+
+
+def _leaked(drawn: Array, size: int) -> Array:
+    """Lines (..., line) of mean 1 as the taper lets them leak: their correlation is that of the squared taper's spectrum."""
+    lines = drawn.shape[-1]
+    correlation = np.abs(np.fft.fft(taper(size) ** 2)) ** 2
+    lag = np.minimum(np.arange(lines), lines - np.arange(lines))
+    transfer = np.sqrt(np.maximum(np.fft.rfft(correlation[lag] / correlation[0]).real, 0.0))
+    leaked = 1.0 + np.fft.irfft(np.fft.rfft(drawn - 1.0, axis=-1) * transfer, lines, axis=-1)
+    return np.maximum(leaked, drawn.min(axis=-1, keepdims=True))
 
 
 def _coherency(shape: Array, size: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.complex128]:
