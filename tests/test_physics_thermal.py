@@ -112,6 +112,23 @@ def test_shupe_is_invisible_at_a_steady_ramp_and_a_step_where_it_begins():
     np.testing.assert_allclose(surface.window_mean.values[[0, 3, 5]], [0.0, 0.2, 0.2], atol=1e-9)
 
 
+def test_a_bias_that_follows_the_temperature_late_is_two_effects_together():
+    """``y' = (T - y) / L`` after a step and along a ramp, from a T and -a L of the lagged change of T."""
+    t, a, lag = (np.arange(8000) - 2000) / 10.0, 0.02, 90.0
+    after = np.maximum(t, 0.0)
+    settled = -np.expm1(-after / lag)
+    for warm, late in (
+        (np.where(t > 0, 27.0, 20.0), 20.0 + 7.0 * settled),
+        (20.0 + 0.03 * after, 20.0 + 0.03 * (after - lag * settled)),
+    ):
+        tables = (
+            {"name": "temperature_bias", "sensitivity": a, "reference": 20.0},
+            {"name": "shupe", "sensitivity": -a * lag / 60.0, "lag": lag, "modes": 1},
+        )
+        found = sum(run(make_effect(table), size=t.size, drivers={"temperature": warm})[0] for table in tables)
+        np.testing.assert_allclose(found, a * (late - 20.0), atol=1e-3 * a * 7.0)
+
+
 def test_a_ramp_seen_through_a_late_sensor_is_felt_when_it_begins():
     """T as a sensor of 40 s shows a ramp that begins at 0: the winding of one mode follows the true ramp, ``v (1 - exp(-t / lag))``."""
     rate, lag, late, v = 10.0, 60.0, 40.0, 2.0
