@@ -37,6 +37,7 @@ from gyrostab.diagnose.modelling.limits import limits
 from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.modelling.refit import fit_claims
+from gyrostab.diagnose.naming.levels import without_levels
 from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
 from gyrostab.diagnose.naming.name import Naming, name_effects
 from gyrostab.diagnose.reduction.reduced import reduce_log
@@ -246,12 +247,14 @@ def _concluded(
     fitted = first if noise is baseline else fit_claims(naming, noise)
     after = predicted(naming, noise) if naming.claims else baseline
 
-    def trained(known: NDArray[np.bool_]) -> xr.Dataset:
-        own = recalibrate(raw, baseline, first, known)
-        return predicted(with_noise(raw, own), own, known)
+    told, hopping = without_levels(raw)
 
-    odd = sum(part.gain for claim in naming.claims for part in claim.parts if part.candidate.view == "marks")  # no other number has them
-    held = held_out(reduced, baseline, trained if naming.claims else baseline, more_gain=odd)
+    def trained(known: NDArray[np.bool_]) -> xr.Dataset:
+        own = recalibrate(told, baseline, first, known)
+        return predicted(with_noise(told, own), own, known)
+
+    odd = sum(part.gain for claim in told.claims for part in claim.parts if part.candidate.view == "marks")  # no other number has them
+    held = held_out(reduced, baseline, trained if told.claims else baseline, more_gain=odd + hopping)
     mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level / 2.0))
     mismatches += claim_tables(naming, reduced, mismatches)
     mismatches += unknown_tables(naming, reduced, mismatches)

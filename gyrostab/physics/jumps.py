@@ -229,6 +229,7 @@ class Telegraph(Effect):
         return Prediction(
             spectrum={"step": np.broadcast_to(density, (windows.begin.size, density.size))},
             wander={"step": (self.correlation_time, np.full(windows.begin.size, share * (1.0 - share)))},
+            levels="step",
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:

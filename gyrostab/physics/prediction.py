@@ -104,6 +104,8 @@ class Prediction:
     wander : mapping of str to (float, ndarray of shape (window,))
         Parameter -> a random mean: time constant of its memory [s], inf for a walk; and per squared unit its variance
         [degree2 hour-2], for a walk the growth of its variance [degree2 hour-2 s-1], in every window.
+    levels : str
+        Parameter that is the step between two levels of the mean, where it hops to and fro between them at random.
     """
 
     mean: Mapping[str, Array] = field(default_factory=dict)
@@ -117,3 +119,4 @@ class Prediction:
     order: Mapping[str, NDArray[np.complex128]] = field(default_factory=dict)
     phase_locked: Mapping[str, Array] = field(default_factory=dict)
     wander: Mapping[str, tuple[float, Array]] = field(default_factory=dict)
+    levels: str = ""

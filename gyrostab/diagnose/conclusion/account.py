@@ -30,8 +30,9 @@ _SHOWS: dict[str, tuple[str, ...]] = {
     "phase_locked": ("spectrum", "davar", "distribution", "mean"),
     "transfer": ("davar", "cross_axis", "spectrum", "mean", "distribution"),
     "wander": ("mean", "davar", "restart", "cross_axis"),
+    "levels": ("mean", "restart", "davar", "distribution", "cross_axis"),
 }
-_MODELLED = ("mean", "power", "cross", "wander")  # parts that the baseline with the effects holds
+_MODELLED = ("mean", "power", "cross", "wander", "levels")  # parts that the baseline with the effects holds
 _LEFT = 0.3  # of a mismatch, that an error of the form may leave
 _ACTS = 0.2  # of its largest, that a contribution counts as there
 _MEETS = 0.3  # of the shorter of effect and mismatch
@@ -135,7 +136,7 @@ def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
     """
     if str(box["view"]) not in _SHOWS.get(part.candidate.view, ()):
         return False
-    if part.candidate.view in ("mean", "wander") and box["view"] == "cross_axis" and box["what"] != "slow":
+    if part.candidate.view in ("mean", "wander", "levels") and box["view"] == "cross_axis" and box["what"] != "slow":
         return False
     if part.candidate.view != "line" or part.place < 0 or box["view"] == "distribution":
         return True

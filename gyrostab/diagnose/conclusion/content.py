@@ -55,8 +55,8 @@ _LEAST_P = 1e-12
 _GENERIC_VIEW = {"~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution"}
 #: Where an effect shows -> view in which it is told.
 _PART_VIEW = {
-    "mean": "mean", "wander": "mean", "power": "davar", "transfer": "davar", "cross": "cross_axis", "marks": "distribution",
-    "line": "spectrum", "order": "spectrum", "phase_locked": "spectrum",
+    "mean": "mean", "wander": "mean", "levels": "mean", "power": "davar", "transfer": "davar", "cross": "cross_axis",
+    "marks": "distribution", "line": "spectrum", "order": "spectrum", "phase_locked": "spectrum",
 }  # fmt: skip
 _BUMP = 0.371  # averaging time times frequency where the Allan variance of a sine is largest
 _MOST_LINES = 4000

@@ -34,7 +34,7 @@ __all__ = [
 
 Array = NDArray[Any]
 #: Where an effect can show, in the order in which they are looked at.
-VIEWS = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander")
+VIEWS = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander", "levels")
 _MOST_VALUES, _MOST_VARIANTS = 60, 200
 #: Effect -> largest size that is plausible, of each of its parameters.
 LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}

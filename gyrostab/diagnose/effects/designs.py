@@ -32,7 +32,8 @@ class Variant:
         By view. mean: (column, axis, block) [degree hour-1 per unit]; power: (column, axis, block, band), added density
         [degree2 hour-2 Hz-1 per unit], of the squared parameter where `squared`; cross: the same for the product of the factors of two
         axes; order: (1, axis, harmonic), complex; phase_locked: (column, phase); transfer: (column, band), complex; marks, line: empty;
-        wander: (column, block). The axis has the size 1 where all axes have the same.
+        wander: (column, block); levels: empty before the course is told by the means, then (1, 1, block). The axis has the size 1 where all
+        axes have the same.
     squared : bool
         The parameter enters by its square.
     time : float
@@ -207,6 +208,12 @@ def _wanders(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coef
             yield Variant(values, (name,), np.asarray(variance)[None], squared=True, time=time)
 
 
+def _levels(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Iterator[Variant]:
+    """Two levels: the means themselves tell the course and its times."""
+    if seen.levels:
+        yield Variant({}, (seen.levels,), np.empty(0))
+
+
 BUILDERS = {
     "marks": _marks,
     "mean": _means,
@@ -216,4 +223,5 @@ BUILDERS = {
     "phase_locked": _profiles,
     "line": _lines,
     "wander": _wanders,
+    "levels": _levels,
 }

@@ -257,6 +257,7 @@ _TAKERS = {
     "transfer": _transfer,
     "line": _line,
     "marks": _marks,
+    "levels": _mean,
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import xarray as xr
@@ -13,6 +13,7 @@ from gyrostab.diagnose.effects.candidates import Candidate, Variant
 from gyrostab.diagnose.effects.cells import State, cells_of, drawn, view_rows
 from gyrostab.diagnose.gains.folds import fold_subsets
 from gyrostab.diagnose.gains.gain import cell_factors, mean_factors, score
+from gyrostab.diagnose.gains.levels import Courses, level_gains
 from gyrostab.diagnose.gains.lines import expected_lines, line_gains
 from gyrostab.diagnose.gains.tallies import (
     OF_LATTICE,
@@ -27,6 +28,7 @@ __all__ = ["Found", "Tallies", "gains", "together", "totals"]
 
 Array = NDArray[np.float64]
 _PRICE = 1.5  # nats that another axis or view must bring
+_MOST_BLOCKS = 20_000  # of null records that come together, in which two levels are sought on an axis
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,8 @@ def gains(
             found += [] if tallies is None else _marks(group, data, state, folds, tallies)
         elif view == "line":
             found += _lines(group, data, state)
+        elif view == "levels":
+            found += _levels(group, data, state)
         elif view != "wander":
             found += _cells(group, data, state, folds, rng)
     return found
@@ -224,3 +228,30 @@ def _lines(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[F
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     places = np.repeat(place[:, None], len(rows), axis=1)
     return [Found(each, rows, best, tuple(each.variants[0] for _ in rows), places) for each in group]
+
+
+def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[Found]:
+    """A bias of two levels, by axis.
+
+    Its gain is below the logarithm of a Bayes factor, which chance lets pass x nats in exp(-x) of all records at most. So where
+    records are long, some of the null records are enough.
+    """
+    records = data.sizes.get("record", 1)
+    some = data.isel(record=slice(max(1, _MOST_BLOCKS // data.sizes["block"]))) if "record" in data.dims else data
+    rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
+    gain = np.full((records, len(rows)), -np.inf)
+    courses: list[Courses] = []
+    for row, axis in enumerate(state.axes):
+        given = state.given.get(("mean", axis))
+        found, course = level_gains(some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None)
+        gain[: found.size, row] = found
+        courses.append(course)
+    return [Found(each, rows, gain, tuple(_course(each.variants[0], one, state) for one in courses)) for each in group]
+
+
+def _course(variant: Variant, found: Courses, state: State) -> Variant:
+    """The variant with the course of the first record, and its mean times [s]."""
+    block = float(state.reduced.attrs["block_s"])
+    low, high = found.times[0] * block
+    values = {"low": float(low), "high": float(high), "hops": float(found.hops[0])}
+    return replace(variant, values=values, design=found.share[0][None, None])

@@ -88,7 +88,7 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
 def part_mixture(part: Part, state: State, variant: Variant | None = None) -> Mixture:
     """Sizes of a part's columns, in the unit of the parameters (or their squares), when `state` is in the model beside it."""
     variant = variant or part.variant
-    if part.candidate.view == "mean":
+    if part.candidate.view in ("mean", "levels"):
         row = state.axes.index(part.row[0])
         return mean_mixture(state, part.row[0], mean_columns(variant, row))
     candidate = replace(part.candidate, variants=(variant,))

@@ -163,7 +163,7 @@ def _add(out: _Seen, part: Part, naming: Naming, baseline: xr.Dataset, axis: str
         out.known += _followed(part, replace(state, weight=naming.state.weight))
     elif view == "phase_locked":
         out.known += _comb(part, replace(state, weight=naming.state.weight))
-    elif view in ("mean", "power", "order", "line"):
+    elif view in ("mean", "levels", "power", "order", "line"):
         given = take_part(state, part).given
         out.free += [np.broadcast_to(one, out.known.shape) for one in given.get(("power", axis), [])]
         out.means += given.get(("mean", axis), [])

@@ -16,6 +16,7 @@ from gyrostab.diagnose.effects.cells import State, begin_state, pair_rows
 from gyrostab.diagnose.effects.explained import Part, explain_away, mirrored
 from gyrostab.diagnose.effects.response import is_filter
 from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
+from gyrostab.diagnose.modelling.levels import level_sizes
 from gyrostab.diagnose.naming.filters import filter_sizes
 from gyrostab.diagnose.naming.name import AMBIGUOUS, Claim, Naming
 from gyrostab.diagnose.naming.odd import line_size, mark_sizes
@@ -339,4 +340,8 @@ def _odd(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming)
     return mark_sizes(parts[0].candidate.effect, parts[0].variant.columns[0], parts[0].row[0], state.reduced, naming.tallies)
 
 
-_SIZES = {"cross": _common, "order": _turning, "line": _line, "marks": _odd}
+def _levels(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    return level_sizes(parts, axes, state)
+
+
+_SIZES = {"cross": _common, "order": _turning, "line": _line, "marks": _odd, "levels": _levels}

@@ -150,11 +150,16 @@ def form_error(parts: Sequence[Part], chosen: Sequence[Claim | Unknown], *, shar
     that the record tells well, but its spectrum is that of a simple law, in place of mounts and decimators: what that leaves over
     frequency, a filter takes for its own.
     """
-    views = [(part.candidate.view, set(part.row), part.candidate.effect) for part in parts if part.candidate.view != "line"]
+    views = [(_kind(part), set(part.row), part.candidate.effect) for part in parts if part.candidate.view != "line"]
     error = 0.0
     for one in chosen:
         for part in one.parts:
-            beside = [effect for view, axes, effect in views if part.candidate.view == view and axes & set(part.row)]
+            beside = [effect for view, axes, effect in views if _kind(part) == view and axes & set(part.row)]
             of_spectrum = part.candidate.view == "power" and isinstance(one, Claim) and bool(one.driver) and _FILTER in beside
             error += max(_SPECTRUM if of_spectrum else 0.0, share) * part.gain if beside else 0.0
     return error
+
+
+def _kind(part: Part) -> str:
+    """View of a part, for what it leaves to others: two levels are seen in the means."""
+    return "mean" if part.candidate.view == "levels" else part.candidate.view

@@ -23,7 +23,7 @@ _BEYOND, _FAR = 6.0, 100.0  # times the scatter of the means at rest
 _GROWN = 2  # blocks to either side that belong to a motion
 _FEWEST, _MOST = 2, 0.5  # blocks that move, and share of them: what turns most of the time has no rest to be compared with
 _ROUNDS = 3
-_MEANS = ("mean", "wander", "marks", "order", "transfer")  # views of effects that account for a mean that moves
+_MEANS = ("mean", "levels", "wander", "marks", "order", "transfer")  # views of effects that account for a mean that moves
 _KEPT = ("mean", "power", "cross")
 
 

@@ -21,7 +21,8 @@ from gyrostab.diagnose.gains.tallies import Expected
 from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown, form_error, unknown_of, with_claim
 from gyrostab.diagnose.naming.complete import flexible, redness, unrest
 from gyrostab.diagnose.naming.filters import without_slopes
-from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_of, gain_sum, parts_of, tried_again, without_lines
+from gyrostab.diagnose.naming.levels import followed_first, renewed
+from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, parts_of, tried_again, without_lines
 from gyrostab.diagnose.naming.structure import PLAINER, possible, structural
 from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.errors import OptionError
@@ -211,6 +212,7 @@ class _Search:
         shared = [key for key in passing if gain_sum(_witnessed(parts[key], state)) > need[key]]
         # odd samples first: they raise powers and means too, and not the other way round; then motion that another sensor sees as well
         passing = odd or shared or without_slopes(self._without_locked_lines(passing, parts, state), parts, state, self.folds)
+        passing = followed_first(passing, parts)
         if not passing:
             return None
         top = gain_sum(parts[passing[0]])
@@ -308,7 +310,7 @@ class _Search:
         lines = {part.place for other in chosen for part in other.parts if part.candidate.effect == PLAIN_LINE}
         rivals += structural(claim.effect, claim.parts, state, lines=len(lines))
         others = tuple(dict.fromkeys(name for name in [*claim.alternatives, *rivals] if name != claim.effect))
-        fresh = tuple(replace(part, gain=gain_of(mine.get(key, []), part)) for part in claim.parts)
+        fresh = tuple(renewed(mine.get(key, []), part) for part in claim.parts)
         return replace(claim, gain=gain, alternatives=others, parts=fresh)
 
     def _complete(self, start: State, state: State, claims: list[Claim], unknown: Sequence[Unknown]) -> tuple[list[Claim], list[Unknown]]:

@@ -9,6 +9,7 @@ import numpy as np
 from gyrostab.diagnose.effects.candidates import LARGEST
 from gyrostab.diagnose.effects.cells import State
 from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.gains.levels import level_gains
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.registry import effects
 
@@ -17,7 +18,6 @@ __all__ = ["PLAINER", "STRUCTURAL", "possible", "structural"]
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 STRUCTURAL: dict[str, tuple[str, ...]] = {
     "gauss_markov": ("telegraph",),
-    "telegraph": ("gauss_markov",),
     "spectral_line": ("real_motion", "supply_bias"),
 }
 #: Effect -> effect that it becomes where a parameter goes to its end: without play, hysteresis is proportional to temperature.
@@ -26,6 +26,7 @@ _SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
 _SURE = 3.0  # standard errors beyond its range, from which on a size is impossible
 _COMB = 3  # lines that may be one comb
 _MOVING = 1.5  # times the expected power, from which on an axis moves
+_MORE, _FORM = 3.0, 0.01  # nats that further levels may gain, and of the first two's
 _LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
 
 
@@ -46,6 +47,8 @@ def _possible(part: Part, state: State) -> bool:
         return bool(np.abs(part_mixture(part, state).moments()[0]).max() <= LARGEST[effect])
     if view == "mean" and not _in_range(part, state):
         return False
+    if view == "levels" and _more_levels(part, state):
+        return False
     return not (part.variant.squared and view == "power" and part_size(part, state)[0] <= 0.0)
 
 
@@ -57,6 +60,14 @@ def _in_range(part: Part, state: State) -> bool:
     sizes, covariance = part_mixture(part, state).moments()
     least = np.abs(sizes) - _SURE * np.sqrt(np.diagonal(covariance))
     return all(size <= largest.get(name, np.inf) for name, size in zip(part.variant.columns, least, strict=True))
+
+
+def _more_levels(part: Part, state: State) -> bool:
+    """Whether, beside the two levels, the bias hops once more: then it has three or more."""
+    axis = part.row[0]
+    given = np.stack([*state.given.get(("mean", axis), []), part.variant.design[0, 0]], axis=-1)
+    gain, _ = level_gains(state.reduced, state.baseline, axis=axis, given=given)
+    return bool(gain[0] > _MORE + _FORM * part.gain)
 
 
 def _moves(axis: str, state: State) -> bool:
@@ -74,6 +85,8 @@ def structural(effect: str, parts: Sequence[Part], state: State, *, lines: int =
         out.append("feedback_reset")
     if effect == "dead_zone" and len(state.axes) == 1:  # no other axis says whether the sample was lost
         out.append("held_samples")
+    if effect == "telegraph" and not any(part.candidate.view == "levels" for part in parts):
+        out.append("gauss_markov")  # two levels show in the means only
     if effect == "vibration_rectification":
         vibration = reduced[f"channel_{parts[0].candidate.driver[0]}"].values
         good = np.isfinite(vibration)

@@ -1,0 +1,119 @@
+"""Block means of a bias that hops between two levels, as a hidden Markov model: forward and backward through many records.
+
+The state is the level at the end of a block. A block is cut into parts, in each of which the bias stands on one level, so that blocks
+with hops inside have the laws of their means.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import KERNEL
+
+__all__ = ["level_tables", "levels_smooth"]
+
+Array = NDArray[np.float64]
+_TINY = 1e-290
+
+
+def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
+    """Chances of a block of two levels.
+
+    Parameters
+    ----------
+    low, high : ndarray, shape (record,)
+        Mean times on the levels [blocks].
+    parts : int
+        Parts of a block.
+
+    Returns
+    -------
+    chance : ndarray, shape (record, 2, 2, parts + 1)
+        From the level before, to that at the end, with so many parts on the upper one.
+    rises : ndarray, shape (record, 2, 2, parts + 1)
+        Expected steps up, times the chance.
+
+    Examples
+    --------
+    >>> chance, rises = level_tables(np.array([4.0]), np.array([2.0]), 5)
+    >>> chance[0].sum(axis=(1, 2)).round(9), chance[0, :, 1].sum(axis=1).round(3)  # after a block from low, and from high
+    (array([1., 1.]), array([0.176, 0.648]))
+    """
+    stay = np.exp(-(1.0 / low + 1.0 / high) / parts)
+    up = high / (low + high) * (1.0 - stay)
+    down = low / (low + high) * (1.0 - stay)
+    move = ((1.0 - up, up), (down, 1.0 - down))
+    chance, rises = np.zeros((2, low.size, 2, 2, parts + 1))
+    chance[:, 0, 0, 0] = chance[:, 1, 1, 0] = 1.0
+    for _ in range(parts):
+        before, counted = chance.copy(), rises.copy()
+        chance[:], rises[:] = 0.0, 0.0
+        for old in range(2):
+            for new in range(2):
+                by = move[old][new][:, None, None]
+                come, fell = before[:, :, old, : parts + 1 - new], counted[:, :, old, : parts + 1 - new]
+                chance[:, :, new, new:] += come * by
+                rises[:, :, new, new:] += (fell + (come if new > old else 0.0)) * by
+    return chance, rises
+
+
+@njit(**KERNEL)
+def levels_smooth(like: Array, chance: Array, rises: Array, start: Array) -> tuple[Array, Array, Array, Array]:
+    """Evidence of block means, and what they say of the share of each block on the upper level.
+
+    Parameters
+    ----------
+    like : ndarray, shape (record, n, parts + 1)
+        Likelihood of each block mean by the number of parts on the upper level, over anything; 1 where it is missing.
+    chance, rises : ndarray, shape (record, 2, 2, parts + 1)
+        From `level_tables`.
+    start : ndarray, shape (record, 2)
+        Chances of the levels before the first block.
+
+    Returns
+    -------
+    log : ndarray, shape (record,)
+        Log likelihood.
+    share, square : ndarray, shape (record, n)
+        Expected share of the block on the upper level, and its square.
+    up : ndarray, shape (record,)
+        Expected steps up.
+    """
+    records, n, width = like.shape
+    parts = width - 1
+    log, up = np.zeros(records), np.zeros(records)
+    share, square = np.zeros((records, n)), np.zeros((records, n))
+    ahead, scale = np.empty((n, 2)), np.empty(n)  # at the start of every block
+    for r in range(records):
+        first, second = start[r, 0], start[r, 1]
+        for t in range(n):
+            ahead[t, 0], ahead[t, 1] = first, second
+            to_low, to_high = 0.0, 0.0
+            for m in range(width):
+                to_low += (first * chance[r, 0, 0, m] + second * chance[r, 1, 0, m]) * like[r, t, m]
+                to_high += (first * chance[r, 0, 1, m] + second * chance[r, 1, 1, m]) * like[r, t, m]
+            scale[t] = max(to_low + to_high, _TINY)
+            first, second = to_low / scale[t], to_high / scale[t]
+            log[r] += np.log(scale[t])
+        low, high = 1.0, 1.0  # what is behind, by the level at the end of the block
+        for t in range(n):
+            t = n - 1 - t
+            from_low, from_high = 0.0, 0.0
+            for m in range(width):
+                part = like[r, t, m] / scale[t]
+                below = part * (chance[r, 0, 0, m] * low + chance[r, 0, 1, m] * high)
+                above = part * (chance[r, 1, 0, m] * low + chance[r, 1, 1, m] * high)
+                from_low += below
+                from_high += above
+                weight = (ahead[t, 0] * below + ahead[t, 1] * above) * m
+                share[r, t] += weight
+                square[r, t] += weight * m
+                stepped = ahead[t, 0] * (rises[r, 0, 0, m] * low + rises[r, 0, 1, m] * high)
+                stepped += ahead[t, 1] * (rises[r, 1, 0, m] * low + rises[r, 1, 1, m] * high)
+                up[r] += part * stepped
+            low, high = from_low, from_high
+            share[r, t] /= parts
+            square[r, t] /= parts * parts
+    return log, share, square, up

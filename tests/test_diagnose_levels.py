@@ -1,0 +1,196 @@
+"""A bias that hops between two levels in the block means: what it gains, what else gains nothing, and what a diagnosis makes of it."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.signal import lfilter
+
+from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.effects.candidates import Candidate, Variant
+from gyrostab.diagnose.effects.cells import State
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.gains.levels import HOPS, level_courses, level_gains
+from gyrostab.diagnose.modelling.levels import level_sizes
+from gyrostab.diagnose.naming.levels import followed_first
+from gyrostab.diagnose.naming.structure import possible
+from gyrostab.simulate import simulate
+
+BLOCKS, STEP, WHITE = 100, 20.0, 0.01
+WALKS, FLICKERS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0]), np.array([0.0, 0.05, 0.2])
+
+
+def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
+    """Records (record, block) as reduced data of one axis, and a baseline in which K and B are free."""
+    begin = np.arange(mean.shape[1]) * STEP
+    data = xr.Dataset(
+        {"mean": (("record", "axis", "block"), mean[:, None]), "begin": ("block", begin), "end": ("block", begin + STEP)},
+        {"axis": ["x"]},
+        {"block_s": STEP},
+    )
+    K, B = (one.ravel() for one in np.meshgrid(WALKS, FLICKERS, indexing="ij"))
+    baseline = xr.Dataset(
+        {
+            "known_mean": (("axis", "block"), np.zeros((1, mean.shape[1]))),
+            "mean_variance": (("axis", "block"), np.full((1, mean.shape[1]), WHITE)),
+            **{f"grid_{name}": (("axis", "grid"), one[None]) for name, one in (("K", K), ("B", B), ("prior", 0.0 * K))},
+        },
+        {"axis": ["x"]},
+    )
+    return data, baseline
+
+
+def hops(rng: np.random.Generator, low: float, high: float, blocks: int = BLOCKS) -> np.ndarray:
+    """Share of each block on the upper level; times in seconds."""
+    fine, t, level = np.zeros(blocks * 20), 0.0, int(rng.integers(2))
+    while t < fine.size:
+        stay = rng.exponential((low, high)[level])
+        fine[int(t) : int(t + stay) + 1] = level
+        t, level = t + stay, 1 - level
+    return fine.reshape(blocks, 20).mean(axis=1)
+
+
+def white(rng: np.random.Generator, records: int) -> np.ndarray:
+    return np.sqrt(WHITE) * rng.standard_normal((records, BLOCKS))
+
+
+def test_finds_hops_and_their_numbers() -> None:
+    rng = np.random.default_rng(1)
+    course = np.stack([hops(rng, 120.0, 240.0) for _ in range(20)])
+    gain, found = level_gains(*frame(0.6 * course + white(rng, 20)), axis="x")
+    assert np.median(gain) > 20.0
+    assert (gain > 5.0).mean() >= 0.9
+    assert np.median(found.step) == pytest.approx(0.6, rel=0.05)
+    np.testing.assert_allclose(np.median(found.times, axis=0) * STEP, [120.0, 240.0], rtol=0.3)
+    assert np.sqrt(np.mean((found.share[gain > 5.0] - course[gain > 5.0]) ** 2)) < 0.12
+
+
+def test_finds_hops_beside_a_walk_of_several_steps() -> None:
+    rng = np.random.default_rng(2)
+    walk = np.cumsum(0.07 * rng.standard_normal((20, BLOCKS)), axis=1)
+    course = np.stack([hops(rng, 150.0, 150.0) for _ in range(20)])
+    gain, found = level_gains(*frame(1.5 * course + walk + white(rng, 20)), axis="x")
+    assert np.median(gain) > 10.0
+    assert np.median(found.step[gain > 10.0]) == pytest.approx(1.5, rel=0.1)
+
+
+def test_is_a_lower_bound_of_a_bayes_factor() -> None:
+    """Over records of the noise that the baseline allows, the mean Bayes factor is one."""
+    rng = np.random.default_rng(3)
+    K = rng.choice(WALKS, 300) * np.sqrt(STEP / 3600.0)
+    mean = white(rng, 300) + np.cumsum(K[:, None] * rng.standard_normal((300, BLOCKS)), axis=1)
+    gain, _ = level_gains(*frame(mean), axis="x")
+    assert np.isfinite(gain).mean() > 0.3
+    assert np.exp(gain).mean() < 1.0
+    assert gain.max() < 4.0
+
+
+@pytest.mark.parametrize("size", [0.3, 1.0])
+@pytest.mark.parametrize("time", [20.0, 60.0, 200.0])
+def test_a_bias_on_a_spring_is_no_bias_of_two_levels(time: float, size: float) -> None:
+    rng = np.random.default_rng(4)
+    keep = np.exp(-1.0 / time)
+    fine = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal((30, BLOCKS * 20 + 3000)))[:, -BLOCKS * 20 :]
+    gain, _ = level_gains(*frame(size * fine.reshape(30, BLOCKS, 20).mean(axis=2) + white(rng, 30)), axis="x")
+    assert gain.max() < 3.0
+
+
+def test_one_jump_and_back_are_no_two_levels() -> None:
+    mean = np.zeros((1, BLOCKS)) + np.repeat([0.0, 2.0, 0.0], [30, 40, 30])
+    gain, found = level_gains(*frame(mean + white(np.random.default_rng(5), 1)), axis="x")
+    assert found.hops[0] == pytest.approx(2.0, abs=0.2)
+    assert found.hops[0] < HOPS
+    assert gain[0] == -np.inf
+
+
+def test_what_is_given_is_not_found_again_and_blocks_may_be_missing() -> None:
+    rng = np.random.default_rng(6)
+    course = hops(rng, 150.0, 150.0)
+    ramp = np.linspace(0.0, 20.0, BLOCKS)
+    data, baseline = frame((0.8 * course + ramp)[None] + white(rng, 1))
+    data["mean"][:, :, 20:35] = np.nan
+    with_ramp, found = level_gains(data, baseline, axis="x", given=ramp[:, None])
+    assert with_ramp[0] > 10.0
+    assert found.step[0] == pytest.approx(0.8, abs=0.1)
+    again, _ = level_gains(data, baseline, axis="x", given=np.stack([ramp, course], axis=1))
+    assert again[0] < 1.0
+
+
+def test_the_other_sign_is_the_same_bias() -> None:
+    rng = np.random.default_rng(7)
+    values = (hops(rng, 100.0, 300.0) + white(rng, 1)[0])[:, None]
+    variance, all_there, constant = np.full(BLOCKS, WHITE), np.ones(BLOCKS, bool), np.ones((BLOCKS, 1))
+    one, other = (level_courses(sign * values, variance, all_there, constant) for sign in (1.0, -1.0))
+    np.testing.assert_allclose(one.share, 1.0 - other.share, atol=0.02)
+    np.testing.assert_allclose(one.times, other.times[:, ::-1], rtol=0.02)
+    np.testing.assert_allclose(one.step, other.step, rtol=0.01)
+
+
+def part(state: State, course: np.ndarray, axis: str = "x", gain: float = 50.0) -> Part:
+    variant = Variant({"low": 100.0, "high": 200.0, "hops": 18.0}, ("step",), course[None, None])
+    return Part(Candidate("telegraph", "levels", (), (variant,)), variant, (axis,), gain)
+
+
+def state_of(mean: np.ndarray) -> State:
+    data, baseline = frame(mean[None])
+    return State(data.isel(record=0), baseline, np.ones((1, BLOCKS, 1)), np.zeros((1, BLOCKS), np.bool_))
+
+
+def test_a_bias_of_three_levels_is_not_possible() -> None:
+    rng = np.random.default_rng(8)
+    first, second = hops(rng, 150.0, 150.0), hops(rng, 200.0, 200.0)
+    two = state_of(first + white(rng, 1)[0])
+    assert possible([part(two, first)], two)
+    more = state_of(first + 0.8 * second + white(rng, 1)[0])
+    assert not possible([part(more, first)], more)
+
+
+def test_sizes_are_those_of_the_course() -> None:
+    rng = np.random.default_rng(9)
+    course = hops(rng, 100.0, 200.0)
+    state = state_of(0.5 * course + white(rng, 1)[0])
+    sizes = level_sizes([part(state, course)], ("x",), state)
+    value, error = sizes["step"]
+    assert abs(value - 0.5) < 4.0 * error
+    assert 0.015 < error < 0.06  # twice the noise of a mean over the root of the blocks
+    assert sizes["low"] == (100.0, pytest.approx(100.0 / 3.0))
+    assert sizes["high"] == (200.0, pytest.approx(200.0 / 3.0))
+
+
+def test_what_follows_a_channel_comes_first() -> None:
+    course = np.ones(BLOCKS)
+    levels = part(state_of(course), course)
+    variant = Variant({}, ("sensitivity",), course[None, None])
+    led = Part(Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, ("x",), 20.0)
+    free = Part(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), 20.0)
+    parts = {"telegraph": [levels], "temperature_bias(temperature)": [led], "bias_jump": [free]}
+    assert followed_first(["telegraph", "temperature_bias(temperature)"], parts) == ["temperature_bias(temperature)"]
+    assert followed_first(["telegraph", "bias_jump"], parts) == ["telegraph", "bias_jump"]
+
+
+@pytest.fixture(scope="module")
+def found():
+    model = {
+        "log": {"axes": ["x", "y"]},
+        "noise": {"N": 0.003, "B": 0.002, "K": 0.01},
+        "effect": [{"name": "telegraph", "axes": ["y"], "step": 0.4, "low": 120.0, "high": 90.0}],
+    }
+    return diagnose(simulate(model, duration="30min", rate=5.0, seed=11), nulls=100, seed=1)
+
+
+def test_a_diagnosis_names_it_with_its_numbers(found) -> None:
+    assert [(one["name"], one["axes"]) for one in found.effects] == [("telegraph", ["y"])]
+    numbers = found.effects[0]["parameters"]
+    assert abs(numbers["step"]["value"] - 0.4) < 3.0 * numbers["step"]["stderr"]
+    for name, true in (("low", 120.0), ("high", 90.0)):
+        assert abs(numbers[name]["value"] - true) < 3.0 * numbers[name]["stderr"]
+    assert found.effects[0]["alternatives"] == []
+    assert found.content["held_out"]["log_likelihood_gain"] > 10.0
+
+
+def test_the_model_hops_and_its_noise_does_not(found) -> None:
+    effect = next(one for one in found.model["effect"] if one["name"] == "telegraph")
+    assert float(np.atleast_1d(effect["step"])[0]) == pytest.approx(0.4, rel=0.15)
+    assert found.model["noise"]["y"]["K"] < 0.3  # with the hops for noise it is above 1
+    again = simulate(found.model, duration="30min", rate=5.0, seed=12)["rate"].coarsen(time=100).mean().std("time")
+    assert 0.1 < float(again.sel(axis="y")) < 0.3
+    assert float(again.sel(axis="x")) < 0.08
