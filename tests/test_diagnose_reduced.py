@@ -426,6 +426,12 @@ def test_a_record_that_is_too_short_is_told_how_long_it_must_be():
         reduce_log(log_of(np.zeros(20_000)), block="0.1s")
 
 
+def test_a_single_name_of_a_file_stays_whole():
+    log = log_of(np.random.default_rng(1).standard_normal(24 * 100)).assign_attrs(source_files="run7.csv", notes="after a repair")
+    reduced = reduce_log(log)
+    assert (reduced.attrs["source_files"], reduced.attrs["notes"]) == (["run7.csv"], ["after a repair"])
+
+
 def test_what_is_no_log_is_refused():
     with pytest.raises(SchemaError):
         reduce_log(xr.Dataset())

@@ -14,7 +14,7 @@ from gyrostab.diagnose.reduction.stretches import channel_means, numeric_channel
 from gyrostab.errors import OptionError
 from gyrostab.kernels.smooth import smooth_curve
 from gyrostab.progress import Stage, no_stage
-from gyrostab.schema import GAP_CAUSES, check_log
+from gyrostab.schema import GAP_CAUSES, check_log, texts
 from gyrostab.timegrid import grid_index, grid_times
 from gyrostab.units import INNER
 from gyrostab.windows import duration_seconds, samples
@@ -356,8 +356,8 @@ def _attributes(work: Accumulator, log: xr.Dataset, present: NDArray[np.int64]) 
         "block_s": work.length / work.rate,
         "block_samples": work.length,
         "missing_share": 1.0 - float(present.sum()) / (present.size * work.length),
-        "source_files": list(log.attrs.get("source_files", [])),
-        "notes": list(log.attrs.get("notes", [])),
+        "source_files": texts(log, "source_files"),
+        "notes": texts(log, "notes"),
     }
 
 
