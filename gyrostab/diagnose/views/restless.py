@@ -120,7 +120,7 @@ def scatter_moments(count: Array, total: Array, inverse: Array) -> tuple[Array, 
     --------
     >>> mean, variance = scatter_moments(np.array(10.0), np.array(10 * 50.0), np.array(10 / 50.0))
     >>> mean.round(3), variance.round(2)
-    (np.float64(8.982), np.float64(18.55))
+    (np.float64(8.982), np.float64(18.11))
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         free = count - 1.0
