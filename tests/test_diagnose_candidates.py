@@ -13,6 +13,7 @@ from gyrostab.diagnose.effects.generics import generic_candidates, splines
 from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.gains.gain import cell_factors, power_factors
 from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import simulate
 from tests.named import COEFFICIENT, WORLD, record
@@ -68,6 +69,18 @@ def test_without_a_channel_the_reason_names_it(plain):
     _, reasons = effect_candidates(plain.drop_vars(["channel_vibration"]), COEFFICIENT)
     assert "vibration" in reasons["vibration_noise"]
     assert "ramp" in reasons["feedback_reset"]
+
+
+@pytest.mark.parametrize(("told", "tried"), [([120.0, 160.0], (120.0, 160.0)), (None, (700.0, 800.0)), ("wide", (700.0, 800.0))])
+def test_vibration_folds_from_the_band_that_its_channel_tells(told, tried):
+    shaking = np.random.default_rng(2).uniform(0.0, 5.0, 60_000)
+    log = make_log(np.random.default_rng(1).standard_normal((1, 60_000)), rate=100.0, unit="deg/h", channels={"vibration": (shaking, "g")})
+    if told is not None:
+        log["vibration"].attrs["band_hz"] = told
+    known, _ = effect_candidates(reduce_log(log), COEFFICIENT)
+    variants = [variant for one in known if one.effect == "aliased_vibration" for variant in one.variants]
+    assert variants
+    assert {(one.values["low"], one.values["high"]) for one in variants} == {tried}
 
 
 def test_a_channel_that_stands_still_excites_nothing(plain):

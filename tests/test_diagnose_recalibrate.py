@@ -130,6 +130,12 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
     for axis in "xy":
         value, error = noise_of(noise, "N", axis)
         assert abs(value - 0.003) < 3.0 * error
+    again = {"name": "aliased_vibration", "sensitivity": 0.3, "low": first[0].effect.low, "high": first[0].effect.high}
+    model = reduced_of(again, environment=[shaken])  # 17.5 to 20 Hz fold onto 0 to 2.5 Hz
+    band, loud = model["frequency"].values, model["channel_vibration"].values > 3.0
+    power = model["power"].mean("axis").values
+    above = power[loud].mean(axis=0) / power[~loud].mean(axis=0) - 1.0
+    assert above[(band > 0.5) & (band < 2.0)].min() > 10.0 * abs(above[band > 3.0]).max()
 
 
 @pytest.mark.parametrize("size", [10.0, 40.0])

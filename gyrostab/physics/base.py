@@ -240,7 +240,7 @@ class Effect:
         """Parameters in which the effect is not linear -> values worth a try on these data."""
         return {}
 
-    def points(self, windows: Windows) -> list[Mapping[str, float]]:
+    def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """Points of the grid of these parameters, where not all combinations of their values make sense; empty where all do."""
         return []
 

@@ -104,9 +104,9 @@ class SupplyBias(Effect):
         """The frequency of the ripple, band by band; lags from at once to minutes."""
         return {"frequency": windows.frequency, "lag": _LAGS}
 
-    def points(self, windows: Windows) -> list[Mapping[str, float]]:
+    def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """Lags of what follows channels, frequencies of what does not."""
-        lags: list[Mapping[str, float]] = [{"frequency": self.frequency, "lag": float(lag)} for lag in _LAGS]
+        lags: list[Mapping[str, float | str]] = [{"frequency": self.frequency, "lag": float(lag)} for lag in _LAGS]
         return lags + [{"frequency": float(frequency), "lag": 0.0} for frequency in windows.frequency]
 
     def explain(self, windows: Windows) -> Prediction:

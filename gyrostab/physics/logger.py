@@ -111,7 +111,7 @@ class LoggerFilter(Effect):
             signal = signal[:, :: chunk.setup.oversampling]
         return signal, (sections, inner, taps, memory)
 
-    def points(self, windows: Windows) -> list[Mapping[str, float]]:
+    def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """Low-passes at the rate of the log and of fast instruments, averaged or picked, and averages; never two filters at once."""
         cutoff = windows.rate * np.geomspace(0.02, 1.5, 27)
         found: list[dict[str, float]] = []

@@ -39,6 +39,8 @@ class Windows:
         Centres of the bins of the ramp's phase, from 0 to 1; empty where no ramp was recorded.
     turns : ndarray, shape (window,)
         Turns of the ramp in a second, negative where it falls [Hz]; empty where no ramp was recorded.
+    bands : mapping of str to (float, float)
+        Edges of the band [Hz] that a channel is the rms of, where the log tells.
     """
 
     begin: Array
@@ -53,6 +55,7 @@ class Windows:
     restarts: Array = field(default_factory=lambda: np.empty((0, 2)))
     phase: Array = field(default_factory=lambda: np.empty(0))
     turns: Array = field(default_factory=lambda: np.empty(0))
+    bands: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def centre(self) -> Array:

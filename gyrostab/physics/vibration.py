@@ -14,6 +14,8 @@ from gyrostab.units import INNER
 
 __all__ = ["AliasedVibration", "GSensitivity", "Magnetic", "VibrationRectification"]
 
+_LOWEST = 0.01  # Hz, of an edge of a band
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Vector(Effect):
@@ -177,8 +179,8 @@ class AliasedVibration(Effect):
     references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors", "Optik, linear vibration and three-axis FOGs in MWD")
 
     sensitivity: tuple[float, ...] = parameter("deg/h/g", "rms rate in the band per rms g", typical=3.7, low=-1e6, high=1e6, many=True)
-    low: float = parameter("Hz", "lower edge of the band", default=700.0, low=0.01, high=1e5, source="Wang et al. 2016")
-    high: float = parameter("Hz", "upper edge of the band", default=800.0, low=0.01, high=1e5, source="Wang et al. 2016")
+    low: float = parameter("Hz", "lower edge of the band", default=700.0, low=_LOWEST, high=1e5, source="Wang et al. 2016")
+    high: float = parameter("Hz", "upper edge of the band", default=800.0, low=_LOWEST, high=1e5, source="Wang et al. 2016")
     resonance: float = parameter("Hz", "resonance of the mount; 0 for a rigid one", default=0.0, low=0.0, high=1e5)
     quality: float = parameter("1", "quality of that resonance", default=10.0, low=0.5, high=1000.0)
     sampling: str = parameter("text", "how a sample is taken", default="point", choices=("point", "average"))
@@ -206,6 +208,12 @@ class AliasedVibration(Effect):
         normal = rng.standard_normal((chunk.size, position.size + 1))
         values, position = march(reading.step, reading.read, reading.kick, normal, position)
         return sensitivity[:, None] * (chunk.drivers["vibration"] * values), (reading, rng, position, sensitivity)
+
+    def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
+        """Points and averages of the band that the log tells of its vibration; of the usual band where it tells none."""
+        low, high = windows.bands.get("vibration", (self.low, self.high))
+        edges = {"low": max(low, _LOWEST), "high": max(high, 2.0 * _LOWEST)}
+        return [edges | {"sampling": taken} for taken in ("point", "average")]
 
     def explain(self, windows: Windows) -> Prediction:
         """The folded spectrum, the same process on all axes."""

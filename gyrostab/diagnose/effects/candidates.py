@@ -82,7 +82,17 @@ def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         restarts=spans("restart"),
         phase=(np.arange(reduced.sizes["phase"]) + 0.5) / reduced.sizes["phase"] if "profile" in reduced else np.empty(0),
         turns=reduced["ramp_turns"].values if "ramp_turns" in reduced else np.empty(0),
+        bands={inner: band for inner, name in drivers.items() if (band := _band(reduced[f"channel_{name}"])) is not None},
     )
+
+
+def _band(channel: xr.DataArray) -> tuple[float, float] | None:
+    """Edges of the band [Hz] that a channel says it is the rms of; None where it says nothing that can be a band."""
+    try:
+        low, high = (float(edge) for edge in channel.attrs.get("band_hz", ()))
+    except (TypeError, ValueError):
+        return None
+    return (low, high) if 0.0 <= low < high < np.inf else None
 
 
 def _bridged(values: Array) -> Array:

@@ -279,7 +279,8 @@ def _channels(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         else:
             values = channel_means(log, name, edges, rms=rms)
         units = str(log[name].attrs.get("units", "1"))
-        found[f"channel_{name}"] = ("block", values, _named(f"{'rms' if rms else 'mean'} of {name} over the block", units))
+        told = {"band_hz": log[name].attrs["band_hz"]} if "band_hz" in log[name].attrs else {}
+        found[f"channel_{name}"] = ("block", values, _named(f"{'rms' if rms else 'mean'} of {name} over the block", units) | told)
     return found
 
 
