@@ -204,7 +204,7 @@ def _leaked(drawn: Array, size: int) -> Array:
     lag = np.minimum(np.arange(lines), lines - np.arange(lines))
     transfer = np.sqrt(np.maximum(np.fft.rfft(correlation[lag] / correlation[0]).real, 0.0))
     leaked = 1.0 + np.fft.irfft(np.fft.rfft(drawn - 1.0, axis=-1) * transfer, lines, axis=-1)
-    return np.maximum(leaked, drawn.min(axis=-1, keepdims=True))
+    return np.asarray(np.maximum(leaked, drawn.min(axis=-1, keepdims=True)))
 
 
 def _coherency(shape: Array, size: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.complex128]:
