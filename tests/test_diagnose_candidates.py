@@ -140,7 +140,7 @@ def test_laws_of_the_terms(plain):
 
 def test_gaps_mix_a_density_with_its_mean(plain):
     density = np.linspace(1.0, 2.0, plain.sizes["band"])
-    half = plain.assign(neighbours=plain["neighbours"] * 0.0 + 0.25)
+    half = plain.assign(neighbours=plain["neighbours"] * 0.25)  # a quarter of what a block without gaps has
     mixed = effective(density, half)
     assert np.ptp(mixed[0, 0]) == pytest.approx(0.25)
     np.testing.assert_allclose(effective(density, plain.assign(neighbours=plain["neighbours"] * 0.0 + 1.0))[0, 0], density)
