@@ -14,6 +14,7 @@ __all__ = ["beyond_chance", "count_outliers", "lattice_step", "zeros_together"]
 Array = NDArray[np.float64]
 _SIGMA = 6.0
 _CLEAR = 64.0  # a lattice is as many times coarser than the last digit
+_RARE = 0.01  # of the values, which may stand off a lattice that is coarse
 _NEAR = 2  # blocks on either side that help to tell a block's own noise
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
@@ -139,11 +140,17 @@ def lattice_step(values: Array) -> float:
     >>> noise = np.random.default_rng(1).standard_normal(5000)
     >>> lattice_step(noise), round(lattice_step(np.round(noise / 0.3) * 0.3 + 0.1), 9)
     (0.0, 0.3)
+    >>> round(lattice_step(np.append(np.round(noise / 0.3) * 0.3, [17.77, -23.91])), 9)  # two spikes off the lattice
+    0.3
     """
     finite = values[np.isfinite(values)]
     if finite.size < 32:
         return 0.0
-    levels = np.unique(finite)
+    levels, times = np.unique(finite, return_counts=True)
+    order = np.argsort(times, kind="stable")
+    common = np.sort(order[np.cumsum(times[order]) > _RARE * finite.size])
+    if common.size and times[common].min() > 1:  # a coarse lattice: the rarest values may be spikes, off that of the others
+        levels = levels[common]
     size = float(np.abs(levels).max())
     for resolution in (2.0**-23, 2.0**-52):  # as written in single and in double precision
         fine = 8.0 * resolution * size
