@@ -85,16 +85,47 @@ def test_the_noise_is_that_of_the_rest(seen):
     assert (baseline["coefficient"].sel(term="K") < 1.0).all()
 
 
-def claim(effect: str, view: str, *row: str, column: str = "z") -> SimpleNamespace:
-    variant, candidate = SimpleNamespace(columns=(column,)), SimpleNamespace(view=view, witness=())
+def claim(effect: str, view: str, *row: str, column: str = "z", course: np.ndarray | None = None) -> SimpleNamespace:
+    design = np.empty(0) if course is None else course[None, None]
+    variant, candidate = SimpleNamespace(columns=(column,), design=design), SimpleNamespace(view=view, witness=())
     return SimpleNamespace(effect=effect, parts=(SimpleNamespace(candidate=candidate, row=row, variant=variant),))
 
 
-def test_a_named_effect_on_its_means_explains_the_motion(seen):
+def test_an_effect_explains_the_motion_if_it_leaves_next_to_nothing_of_it(seen):
     whole, _ = seen
-    assert not unexplained_motion(whole, [claim("warm_up", "mean", "z")]).any()
-    for other in (claim("warm_up", "mean", "x"), claim("light_power_noise", "power", "z")):
-        np.testing.assert_array_equal(unexplained_motion(whole, [other]), moving_blocks(whole))
+    moving = moving_blocks(whole)
+    bump = np.nan_to_num(whole["mean"].values[2] - np.nanmedian(whole["mean"].values[2]))
+    assert not unexplained_motion(whole, [claim("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)]).any()
+    assert not unexplained_motion(whole, [claim("rotation_line", "order", "z")]).any()
+    step = np.where(np.arange(bump.size) < np.flatnonzero(moving[2]).mean(), 0.0, 1.0)
+    for other in (
+        claim("bias_jump", "mean", "z", course=step),
+        claim("warm_up", "mean", "x", course=bump),
+        claim("light_power_noise", "power", "z"),
+    ):
+        np.testing.assert_array_equal(unexplained_motion(whole, [other]), moving)
+
+
+def test_a_jump_that_stays_is_no_motion_once_it_is_named(still):
+    step = np.where(np.arange(still.sizes["time"]) < 8000, 0.0, 300.0)
+    whole = reduce_log(still.assign(rate=still["rate"] + xr.DataArray(step, dims="time")))
+    assert moving_blocks(whole).any(axis=1).all()
+    blocks = whole["begin"].values * 10.0 >= 8000
+    named = [claim("bias_jump", "mean", axis, course=blocks.astype(float)) for axis in "xyz"]
+    assert not unexplained_motion(whole, named).any()
+
+
+def test_rest_is_found_where_an_axis_turns_more_than_half_of_the_time(still):
+    log = still.copy(deep=True)
+    rate = log["rate"].transpose("axis", "time").values
+    rate[2, 2000:9000] += 400.0 * np.sin(np.pi * np.linspace(0.0, 3.0, 7000)) ** 2
+    whole = reduce_log(log.assign(rate=(("axis", "time"), rate, log["rate"].attrs)))
+    moving = moving_blocks(whole)
+    assert not moving[:2].any()
+    seconds = whole["begin"].values
+    turning = (seconds >= 205.0) & (seconds < 880.0)
+    assert moving[2][turning].all()
+    assert not moving[2][(seconds < 150.0) | (seconds > 960.0)].any()
 
 
 def test_one_mismatch_says_where_it_moves_and_who_sees_it(seen):
