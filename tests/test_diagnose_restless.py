@@ -184,6 +184,19 @@ def test_short_records_are_left_alone(base):
     assert gliding.score(found, base) is None
 
 
+@pytest.mark.parametrize("blocks", [213, 218, 255])
+def test_windows_behind_the_last_average_have_no_score(blocks):
+    small = {"rate": 10.0, "blocks": blocks}
+    found = restless.score(records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small))
+    behind = (found["first"] > blocks // 32 * 32).values
+    assert behind.any()
+    long = np.char.startswith(found["what"].values.astype(str), "restless 640 s")
+    assert long.any()
+    assert np.isnan(found["z"].values[..., behind, :][..., long]).all()
+    whole = (found["stop"] - found["first"] == blocks).values
+    assert np.isfinite(found["z"].values[..., whole, :][..., long]).all()
+
+
 def test_a_part_without_samples_is_stepped_over(base, null):
     found = _some(base, 12, 16)
     _moving_line(found, 0, 20, 60, 7.0 * np.sqrt(40.0 / (8.0 * BLOCKS)))

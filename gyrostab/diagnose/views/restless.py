@@ -214,7 +214,8 @@ def _scatter(level: Array, weight: Array, windows: Windows, span: int, *, single
         there = total > 0
         inverse = np.where(there, 1.0 / total, 0.0)
     average = np.where(there, average, 0.0)
-    inside = Windows(-(-windows.first // span), np.maximum(windows.stop // span, -(-windows.first // span)))
+    begin = np.minimum(-(-windows.first // span), count)  # what is left of the record behind the last average has none
+    inside = Windows(begin, np.maximum(windows.stop // span, begin))
     first, square = over_windows(total * average, inside), over_windows(total * average**2, inside)
     number, weights = over_windows(there.astype(float), inside), over_windows(total, inside)
     with np.errstate(divide="ignore", invalid="ignore"):
