@@ -194,3 +194,22 @@ def test_simulation_of_named_effects_runs(shaken):
         duration="1min", rate=10.0,
     )  # fmt: skip
     assert np.isfinite(log["rate"].values).all()
+
+
+def test_axes_that_the_strongest_view_lacks_have_their_sizes_from_the_next():
+    """Two axes are named by what they share, the third by its power alone: its size is no nought."""
+    world = [{"profile": "vibration", "points": [[0, 0.02], [600, 0.02], [601, 6.0], [1200, 6.0], [1201, 0.02], [3600, 0.02]]}]
+    truth = {"x": 0.2, "y": 0.3, "z": 0.1}
+    effect = {"name": "aliased_vibration", "low": 700.0, "high": 800.0, "sensitivity": list(truth.values()), "axes": list(truth)}
+    reduced = record([effect], environment=world)
+    baseline = calibrate(reduced)
+    candidates, reasons = effect_candidates(reduced, baseline["coefficient"])
+    power, cross = (next(one for one in candidates if (one.effect, one.view) == (effect["name"], view)) for view in ("power", "cross"))
+    parts = [Part(cross, cross.variants[0], ("x", "y"), 90.0), *(Part(power, power.variants[0], (axis,), 40.0) for axis in "yz")]
+    claim = Claim(effect["name"], power.driver, tuple(truth), tuple(parts), 130.0, 8.0)
+    state = explain_away(begin_state(reduced, baseline), parts)
+    (fitted,) = fit_claims(Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)), baseline)
+    assert fitted.effect.sensitivity == pytest.approx(tuple(fitted.parameters[f"sensitivity.{axis}"].value for axis in truth))
+    for axis, size in truth.items():
+        one = fitted.parameters[f"sensitivity.{axis}"]
+        assert one.low - one.stderr < size < one.high + one.stderr

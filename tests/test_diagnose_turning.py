@@ -1,4 +1,4 @@
-"""Earth rate in a tool that turns, whichever way round its axes stand."""
+"""What is locked to the turning of the tool: the earth's rate, whichever way round its axes stand, and lines with their harmonics."""
 
 from __future__ import annotations
 
@@ -18,19 +18,25 @@ from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.simulate import simulate
 
 
-def _log(**effect):
+def _log(*effects, points=((0, 108.0), (1200, 108.0))):
     model = {
         "log": {"axes": ["x", "y"]},
         "noise": {"N": 0.003},
-        "effect": [{"name": "earth_rate", **effect}],
-        "environment": [{"profile": "rotation", "points": [[0, 108.0], [1200, 108.0]]}],
+        "effect": list(effects),
+        "environment": [{"profile": "rotation", "points": [list(one) for one in points]}],
     }
     return simulate(model, duration="20min", rate=10.0, seed=5).compute()
 
 
+def _table(effect, *names):
+    """Some parameters of an effect, as a model has them."""
+    values = {name: getattr(effect, name) for name in names}
+    return {"name": effect.name} | {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+
 @pytest.mark.parametrize("around", [90.0, -90.0])
 def test_earth_rate_is_taken_out_and_made_again(around):
-    log = _log(latitude=45.0, toolface=40.0, off=[90.0, 90.0], around=[0.0, around])
+    log = _log({"name": "earth_rate", "latitude": 45.0, "toolface": 40.0, "off": [90.0, 90.0], "around": [0.0, around]})
     reduced = reduce_log(log)
     baseline = calibrate(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
@@ -43,6 +49,26 @@ def test_earth_rate_is_taken_out_and_made_again(around):
     claim = Claim("earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0)
     naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds)
     (fitted,) = fit_claims(naming, baseline)
-    made = {name: getattr(fitted.effect, name) for name in ("latitude", "toolface", "off", "around")}
-    again = _log(**{name: list(value) if isinstance(value, tuple) else value for name, value in made.items()})
+    again = _log(_table(fitted.effect, "latitude", "toolface", "off", "around"))
     assert float(np.abs(again["rate"] - log["rate"]).max()) < 0.01 * float(log["rate"].std())
+
+
+def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
+    """The second line is the strongest, the third a half of it; x has them all, y the first alone."""
+    points = ((0, 108.0), (600, 108.0), (610, 66.0), (1200, 66.0))
+    both = {"name": "rotation_line", "amplitude": [0.5, 0.4], "phase": [40.0, -60.0], "axes": ["x", "y"]}
+    x = {"name": "rotation_line", "axes": ["x"]}
+    log = _log(both, {**x, "order": 2.0, "amplitude": [0.8], "phase": [100.0]}, {**x, "order": 3.0, "amplitude": [0.4]}, points=points)
+    reduced = reduce_log(log)
+    baseline = calibrate(reduced)
+    known, reasons = effect_candidates(reduced, baseline["coefficient"])
+    orders = [one for one in known if one.view == "order" and one.effect == "rotation_line"]
+    start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
+    parts = by_key(gains(orders, reduced, start, folds))["rotation_line(rotation_rate)"]
+    claim = Claim("rotation_line", parts[0].candidate.driver, ("x", "y"), tuple(parts), gain_sum(parts), 8.0)
+    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), explain_away(start, parts), folds)
+    fitted = fit_claims(naming, baseline)
+    assert [(one.effect.order, one.axes) for one in fitted] == [(1.0, ("x", "y")), (2.0, ("x",)), (3.0, ("x",))]
+    again = _log(*({**_table(one.effect, "amplitude", "phase", "order"), "axes": list(one.axes)} for one in fitted), points=points)
+    left, whole = ((one["rate"] - log["rate"]).std("time").values for one in (again, _log(points=points)))
+    assert (left < 0.05 * whole).all()

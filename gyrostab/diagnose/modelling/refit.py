@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.candidates import Variant
-from gyrostab.diagnose.effects.cells import State, begin_state, pair_rows
+from gyrostab.diagnose.effects.cells import State, begin_state, harmonic_sets, pair_rows
 from gyrostab.diagnose.effects.explained import Part, explain_away, mirrored
 from gyrostab.diagnose.effects.response import is_filter
 from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
@@ -117,8 +117,30 @@ def _fit_claim(claim: Claim, state: State, naming: Naming) -> list[Fitted]:
     filtered = any(is_filter(part.candidate.view, part.variant) for part in claim.parts)  # one logger: its axes are filtered alike
     together = many or filtered or "cross" in views or any(not part.candidate.each for part in claim.parts)
     if together:
-        return [_fitted(claim, claim.axes, list(claim.parts), state, naming)]
+        return [_fitted(claim, _axes(claim, parts), parts, state, naming) for parts in _by_harmonic(claim, state)]
     return [_fitted(claim, (axis,), [part for part in claim.parts if axis in part.row], state, naming) for axis in claim.axes]
+
+
+def _axes(claim: Claim, parts: Sequence[Part]) -> tuple[str, ...]:
+    """Axes of the claim on which the parts are."""
+    return tuple(axis for axis in claim.axes if any(axis in part.row for part in parts))
+
+
+def _by_harmonic(claim: Claim, state: State) -> list[list[Part]]:
+    """Parts of a claim; those of several harmonics of the rotation, each of which has a size and a phase of its own, one by one.
+
+    A harmonic beside the strongest is left out where its amplitude is within two standard errors on every axis.
+    """
+    turning = [part for part in claim.parts if part.candidate.view == "order" and part.candidate.each]
+    sets = harmonic_sets(state.reduced.sizes["harmonic"]) if turning else []
+    there = sorted({k for part in turning for k in sets[part.place]})
+    alone = [[replace(part, place=k) for part in turning if k in sets[part.place]] for k in there]
+    if len(alone) < 2:
+        return [list(claim.parts)]
+    clear = [max(size / error for size, error, _ in (_amplitude(part, state) for part in parts)) for parts in alone]
+    kept = [parts for parts, times in zip(alone, clear, strict=True) if times > 2.0 or times == max(clear)]
+    rest = [part for part in claim.parts if part not in turning]
+    return [[*kept[0], *rest], *kept[1:]]
 
 
 def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State, naming: Naming) -> Fitted:
@@ -136,6 +158,8 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
     sizes = {} if filtered else _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
     if filtered:
         sizes, values = filter_sizes(by_view[view], state)
+    else:
+        sizes = {**_elsewhere(by_view, view, axes, state, naming), **sizes}
     for name, (mean, sd) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
         estimates[name] = _estimate(mean, sd, unit, positive=_positive(kind, name))
@@ -143,6 +167,21 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
     values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
     values |= _words(claim, by_view[view][0], state)
     return Fitted(claim, axes, estimates, _instance(kind, values, axes, claim.driver), next((note for _, note in plain if note), ""))
+
+
+def _elsewhere(
+    by_view: Mapping[str, list[Part]], view: str, axes: tuple[str, ...], state: State, naming: Naming
+) -> dict[str, tuple[float, float]]:
+    """Sizes on axes that the strongest view says nothing of, from the strongest of the others that does."""
+    seen = {axis for part in by_view[view] for axis in part.row}
+    found: dict[str, tuple[float, float]] = {}
+    for other in sorted(set(by_view) - {view}, key=lambda name: -sum(part.gain for part in by_view[name])):
+        lacking = {axis for part in by_view[other] for axis in part.row} - seen
+        if lacking:
+            sizes = _SIZES.get(other, _linear)(by_view[other], axes, state, naming)
+            found |= {name: size for name, size in sizes.items() if name.partition(".")[2] in lacking}
+            seen |= lacking
+    return found
 
 
 def _positive(kind: type[Effect], name: str) -> bool:
@@ -311,10 +350,8 @@ def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Nam
     """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down."""
     out: dict[str, tuple[float, float]] = {}
     for part in parts:
-        mean, covariance = part_mixture(part, state).moments()
-        size = float(math.hypot(mean[0], mean[1]))
-        sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
-        angle, turn = math.degrees(math.atan2(mean[1], mean[0])), math.degrees(sd / max(size, 1e-300))
+        size, sd, angle = _amplitude(part, state)
+        turn = math.degrees(sd / max(size, 1e-300))
         if not part.candidate.each:
             across = size * float(np.abs(part.variant.design).max())
             latitude = math.degrees(math.acos(min(across / 15.041067, 1.0)))
@@ -324,6 +361,13 @@ def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Nam
         out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, turn)}
         out["order"] = (float(state.reduced["harmonic"].values[part.place % state.reduced.sizes["harmonic"]]), 0.0)
     return out
+
+
+def _amplitude(part: Part, state: State) -> tuple[float, float, float]:
+    """Amplitude of the first harmonic of a part, its standard error, and the phase [deg]."""
+    mean, covariance = part_mixture(part, state).moments()
+    sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
+    return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
 
 
 def _line(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
