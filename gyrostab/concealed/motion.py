@@ -151,7 +151,7 @@ def _turning(world: World) -> NDArray[np.bool_]:
 
 
 def earth_rate(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """What is left of the earth's rate on the two turning axes, a quarter of a turn apart."""
+    """What is left of the earth's rate on the two turning axes, a quarter of a turn apart; at rest it stays, at any angle."""
     x, y = tool.cross_axis(_angle(world, rng), across=1.0)
     effect = mean_effect(
         world,
@@ -163,7 +163,6 @@ def earth_rate(world: World, rng: np.random.Generator, *, strength: float) -> Ef
         form="cosine and sine of the toolface",
         differs=False,
         tau=_turn_tau(world),
-        active=_turning(world),
     )
     across = float(effect.parameters["peak"]["value"])  # the earth's rate across the tool, of 15.041 deg/h at most
     if across < tool.EARTH_RATE:

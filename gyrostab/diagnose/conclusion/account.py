@@ -34,28 +34,45 @@ _SHOWS: dict[str, tuple[str, ...]] = {
 }
 _MODELLED = ("mean", "power", "cross", "wander", "levels")  # parts that the baseline with the effects holds
 _LEFT = 0.3  # of a mismatch, that an error of the form may leave
-_ACTS = 0.2  # of its largest, that a contribution counts as there
+_ACTS = 0.1  # of its largest, that a contribution counts as there
+_STILL, _RESTS = 0.05, 0.05  # of the largest, that is as good as nothing, and share of the blocks that must be so
 _MEETS = 0.3  # of the shorter of effect and mismatch
 _MOST_SPANS = 6
 _BESIDE, _SHARP = 3, 0.02  # lines beside a strong one, and share of its frequency, that belong to it
 _BUMP, _WIDE = 0.371, 4.0
 
 
-def acting(claim: Claim, blocks: int) -> NDArray[np.bool_]:
-    """Blocks in which an effect does something, from its designs; all where these do not depend on time."""
+def acting(claim: Claim, reduced: xr.Dataset) -> NDArray[np.bool_]:
+    """Blocks in which an effect does something, from its designs and from the turning of the tool; all where neither depends on time."""
+    blocks = reduced.sizes["block"]
     there = np.zeros(blocks, bool)
     for part in claim.parts:
         design = part.variant.design
+        if part.candidate.view == "order":
+            there |= _turning(reduced)
+            continue
         if part.candidate.view not in ("mean", "power", "cross", "wander") or design.size == 0:
             return np.ones(blocks, bool)
         place = [number for number, size in enumerate(design.shape) if size == blocks]
         if not place:
             return np.ones(blocks, bool)
-        size = np.abs(np.moveaxis(np.asarray(design), place[0], 0).reshape(blocks, -1))
-        size = np.abs(size - np.median(size, axis=0)) if part.candidate.view == "mean" else size
+        size = np.asarray(np.moveaxis(np.asarray(design), place[0], 0).reshape(blocks, -1))
+        size = np.abs(size - _rest(size) if part.candidate.view == "mean" else size)
         largest = np.nanmax(size, axis=0, initial=0.0)
         there |= (size > _ACTS * np.where(largest > 0, largest, np.inf)).any(axis=1)
     return there if there.any() else np.ones(blocks, bool)
+
+
+def _rest(size: Array) -> Array:
+    """Level of every column (block, column) at rest: zero where it stays there for a while, else its median, for the constant is free."""
+    still = np.abs(size) <= _STILL * np.nanmax(np.abs(size), axis=0, initial=0.0)
+    return np.where(still.mean(axis=0) >= _RESTS, 0.0, np.median(size, axis=0))
+
+
+def _turning(reduced: xr.Dataset) -> NDArray[np.bool_]:
+    """Blocks in which the tool turns: those that the harmonics of its turning are measured in."""
+    turn = np.abs(np.nan_to_num(reduced["channel_rotation_rate"].values))
+    return np.asarray(turn > _STILL * turn.max(initial=0.0))
 
 
 def spans(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[float, float]]:
@@ -108,8 +125,7 @@ def explanations(
     """
     boxes = [{str(name): found[name].values[number] for name in found.data_vars} for number in range(found.sizes["mismatch"])]
     scores = _scores(reduced, after, null, boxes)
-    begin, end = reduced["begin"].values, reduced["end"].values
-    when = [spans(acting(claim, begin.size), begin, end) for claim in claims]
+    when = [_reach(claim, reduced) for claim in claims]
     out = []
     for box in boxes:
         gone = _gone(box, scores, null, level)
@@ -146,6 +162,14 @@ def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
         return bool(abs(box["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine)
     tau = _BUMP / mine  # where the Allan variance of a sine is largest
     return str(box["what"]).startswith(("avar", "level", "restless")) and bool(box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE)
+
+
+def _reach(claim: Claim, reduced: xr.Dataset) -> list[tuple[float, float]]:
+    """Stretches whose mismatches an effect can explain: a line of the turning stands out also where a part turns but little."""
+    begin, end = reduced["begin"].values, reduced["end"].values
+    if any(part.candidate.view == "order" for part in claim.parts):
+        return [(float(begin[0]), float(end[-1]))]
+    return spans(acting(claim, reduced), begin, end)
 
 
 def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:

@@ -139,7 +139,7 @@ def claim_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[st
         view = _PART_VIEW.get(strongest.candidate.view, "davar")
         low, high = _taus(strongest, view, reduced)
         p_value = chance_of_gain(naming.null_best, claim.gain)
-        for first, last in spans(acting(claim, begin.size), begin, end):
+        for first, last in spans(acting(claim, reduced), begin, end):
             when = span_text(first, last, float(end[-1]))
             out.append(
                 {
@@ -250,7 +250,7 @@ def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[st
     out = []
     for one in fitted:
         claim = one.claim
-        when = spans(acting(claim, begin.size), begin, end)
+        when = spans(acting(claim, reduced), begin, end)
         whole = float(end[-1])
         out.append(
             {
