@@ -53,3 +53,17 @@ def test_it_is_told_where_they_stand(table, options):
         (fitted,) = fit_claims(found, calibrate(found.state.reduced))[:1]
         assert fitted.effect is not None
         assert fitted.effect.fill == table.get("fill", "repeat")
+
+
+def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
+    rng = np.random.default_rng(4)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    places = 6_000 + 3 * np.arange(14)
+    flips = rng.choice([-1.0, 1.0], 14) * 2.0 ** rng.integers(3, 7, 14)
+    noise[1, places] += flips
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(reduced, 40)
+    (claim,) = (found := name_effects(reduced, baseline, records)).claims
+    assert (claim.effect, claim.axes) == ("spikes", ("y",))
+    (fitted,) = fit_claims(found, baseline)
+    assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0

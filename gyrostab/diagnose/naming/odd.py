@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
-
 import numpy as np
 import xarray as xr
 
@@ -14,6 +12,7 @@ __all__ = ["line_size", "mark_sizes"]
 
 _PER_SPIKE = 3.0  # second differences that hold a spike
 _LIMIT = 6.0  # standard deviations beyond which one counts as an outlier
+_USUAL = 0.2  # of the usual variance of a block, by which that of one may be higher by chance
 _LAW = 0.1  # of the number and the size of outliers, by which the law of their sizes may be another
 Pair = tuple[float, float]
 
@@ -51,7 +50,7 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
     row = [str(one) for one in reduced["axis"].values].index(axis)
     usual = float(tallies.of[mark][0][row]) * reduced.sizes["block"] if mark in tallies.of else 0.0
     count = max(float(reduced[mark].sel(axis=axis).sum()) - usual, 1.0)
-    spread = _spread(reduced, row)
+    spread = _spread(reduced, axis)
     error = math.sqrt(count + usual)
     if effect == "spikes":
         told = _outliers(reduced, axis, spread)
@@ -93,6 +92,8 @@ def _outliers(reduced: xr.Dataset, axis: str, spread: float) -> tuple[float, flo
     tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * most)
     half, far = tails - 3.0, most - tails
     share = (half + np.sqrt(half**2 + far * half)) / far
+    raised = np.maximum(reduced["variance"].sel(axis=axis).values[good] / spread**2 - 1.0, 0.0) + _USUAL
+    share = np.where(many > 1.0, np.fmin(share, raised), share)
     square = float((share * samples[good]).sum() / many.sum())
     limit = _LIMIT * math.sqrt(6.0)
     ends = np.geomspace(2.0, 1e-4, 400)  # the least size that is seen, over the rms size
@@ -101,8 +102,6 @@ def _outliers(reduced: xr.Dataset, axis: str, spread: float) -> tuple[float, flo
     return float(2.0 * norm.sf(0.5 * limit / size) + 4.0 * norm.sf(limit / size)), size * spread, float(many.sum())
 
 
-def _spread(reduced: xr.Dataset, row: int) -> float:
+def _spread(reduced: xr.Dataset, axis: str) -> float:
     """Standard deviation of the samples about the means of their blocks [degree hour-1]."""
-    width = (reduced["band_high"] - reduced["band_low"]).values
-    power: Any = np.nanmedian((reduced["power"].values[row] * width).sum(axis=-1))
-    return math.sqrt(2.0 * float(power))
+    return math.sqrt(float(reduced["variance"].sel(axis=axis).median()))

@@ -105,10 +105,10 @@ def reduce_log(
     Returns
     -------
     xarray.Dataset
-        By ``(axis, block)``: ``mean`` [degree hour-1], ``samples``, ``neighbours``, ``adjacent``, ``kurtosis``, ``outliers``,
-        ``repeats``, ``extremes``, ``zeros``, and of these ``stuck`` and ``filled``. By ``(axis, block, band)``: ``power``
-        [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band),
-        ``cross_neighbours(pair, block)``,
+        By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``, ``neighbours``, ``adjacent``,
+        ``kurtosis``, ``outliers``, ``repeats``, ``extremes``, ``zeros``, and of these ``stuck`` and ``filled``. By
+        ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band),
+        ``cross_neighbours``, ``cross_samples`` (pair, block),
         ``witness_power``, ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
         ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects
         follow late, and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz]
@@ -169,6 +169,7 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
         lines = work.line_sum / (work.line_expected * work.rate)
     variables: dict[str, Any] = {
         "mean": (plane, np.where(enough, moments[..., 0], np.nan), _named("mean rate of the block", _RATE)),
+        "variance": (plane, np.where(enough, moments[..., 1], np.nan), _named("variance of the samples about it", "degree2 hour-2")),
         "samples": (plane, present, _named("samples present", "1")),
         "power": (cube, work.power[axes], _named("mean periodogram of the band, two-sided density", _POWER)),
         "shape": (cube, work.shape, _named("shape of the gamma distribution of the power in white noise", "1")),
@@ -230,6 +231,7 @@ def _beside(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     found["cross_shape"] = (("pair", "block", "band"), work.cross_shape[own], attrs)
     attrs = _named("share of neighbouring pairs of the samples that both axes have, tapered", "1")
     found["cross_neighbours"] = (("pair", "block"), work.cross_neighbours[own], attrs)
+    found["cross_samples"] = (("pair", "block"), work.cross_samples[own], _named("samples that both axes have", "1"))
     found["first"] = ("pair", np.array([names[work.pairs[number][0]] for number in own], dtype=object))
     found["second"] = ("pair", np.array([names[work.pairs[number][1]] for number in own], dtype=object))
     if work.beside:
