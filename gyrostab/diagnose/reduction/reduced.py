@@ -107,9 +107,9 @@ def reduce_log(
     xarray.Dataset
         By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``, ``neighbours``, ``adjacent``,
         ``kurtosis``, ``outliers``, ``repeats``, ``extremes``, ``zeros``, and of these ``stuck`` and ``filled``. By
-        ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band),
-        ``cross_neighbours``, ``cross_samples`` (pair, block),
-        ``witness_power``, ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
+        ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``,
+        ``cross_shape`` (pair, block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
+        ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
         ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects
         follow late, and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz]
         of the bands.
