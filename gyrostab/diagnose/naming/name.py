@@ -23,7 +23,7 @@ from gyrostab.diagnose.naming.complete import flexible, redness, unrest
 from gyrostab.diagnose.naming.filters import without_slopes
 from gyrostab.diagnose.naming.levels import followed_first, renewed
 from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, parts_of, tried_again, without_lines
-from gyrostab.diagnose.naming.structure import PLAINER, possible, structural
+from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural
 from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.errors import OptionError
 from gyrostab.progress import Stage, no_stage
@@ -218,7 +218,8 @@ class _Search:
         top = gain_sum(parts[passing[0]])
         rivals = [key for key in passing if not key.startswith("~") and gain_sum(parts[key]) >= top - AMBIGUOUS - FORM * top]
         effects = {parts[key][0].candidate.effect for key in rivals}
-        rivals.sort(key=lambda key: -gain_sum(parts[key]) + AMBIGUOUS * (self._lonely(parts[key]) or _roundabout(parts[key], effects)))
+        later = {key: self._lonely(parts[key]) or plainer_effect(parts[key], state) in effects for key in rivals}
+        rivals.sort(key=lambda key: -gain_sum(parts[key]) + AMBIGUOUS * later[key])
         rejected: set[str] = set()
         for key in rivals:
             passed, p_value = beats_slides(parts[key], state, self.folds)
@@ -355,8 +356,3 @@ def _weak(named: Sequence[Claim], left: float) -> tuple[list[Claim], float]:
 def _witnessed(parts: Sequence[Part], state: State) -> list[Part]:
     """Parts that a channel sees as well, which is no axis of the gyro itself."""
     return [part for part in parts if part.candidate.view == "transfer" and part.candidate.witness[0] not in state.axes]
-
-
-def _roundabout(parts: Sequence[Part], effects: set[str]) -> bool:
-    """An effect that says less plainly what another one of `effects` says as well."""
-    return PLAINER.get(parts[0].candidate.effect) in effects

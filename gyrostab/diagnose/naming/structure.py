@@ -13,7 +13,7 @@ from gyrostab.diagnose.gains.levels import level_gains
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.registry import effects
 
-__all__ = ["PLAINER", "STRUCTURAL", "possible", "structural"]
+__all__ = ["PLAINER", "STRUCTURAL", "plainer_effect", "possible", "structural"]
 
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 STRUCTURAL: dict[str, tuple[str, ...]] = {
@@ -27,6 +27,7 @@ _SURE = 3.0  # standard errors beyond its range, from which on a size is impossi
 _COMB = 3  # lines that may be one comb
 _MOVING = 1.5  # times the expected power, from which on an axis moves
 _MORE, _FORM = 3.0, 0.01  # nats that further levels may gain, and of the first two's
+_LEAN, _SQUARE = 2e-2, 1e-5  # shares of the turning: of an axis that is across it, at most; and to which one can be squared up
 _LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
 
 
@@ -35,11 +36,35 @@ def possible(parts: Sequence[Part], state: State) -> list[Part]:
     return [part for part in parts if _possible(part, state)]
 
 
+def plainer_effect(parts: Sequence[Part], state: State) -> str | None:
+    """Effect that says the same more plainly; None where there is none.
+
+    A real turning is seen by the cosine of the angle to the axis, which is rarely small; errors of the scale factor are.
+    """
+    effect = parts[0].candidate.effect
+    if effect == "real_motion" and all(_spin(part) and _share(part, state) < _LEAN for part in parts):
+        return "scale_factor"
+    return PLAINER.get(effect)
+
+
+def _spin(part: Part) -> bool:
+    """Whether a part says that an axis sees the turning of the tool."""
+    return part.candidate.effect == "real_motion" and part.candidate.view == "mean" and part.variant.columns == ("spin",)
+
+
+def _share(part: Part, state: State) -> float:
+    from gyrostab.diagnose.effects.sizes import part_size
+
+    return abs(part_size(part, state)[0])
+
+
 def _possible(part: Part, state: State) -> bool:
     from gyrostab.diagnose.effects.sizes import part_mixture, part_size
 
     effect, view = part.candidate.effect, part.candidate.view
     if effect == "misalignment" and view == "transfer" and not _moves(part.candidate.witness[0], state):
+        return False
+    if _spin(part) and _share(part, state) < _SQUARE:
         return False
     if effect == "fringe_hop" and abs(part_size(part, state)[0]) * np.abs(part.variant.design).max() < _SMALLEST_FRINGE:
         return False
