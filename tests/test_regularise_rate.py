@@ -127,6 +127,35 @@ def test_rows_missing_in_a_fixed_pattern_leave_the_declared_grid(pattern, rate, 
     assert np.array_equal(log.rate.values[0], expected(samples), equal_nan=True)
 
 
+@pytest.mark.parametrize("pattern", [[1, 1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0, 1, 1, 0, 0]])
+@pytest.mark.parametrize("rate", [10.0, 248.7])
+@pytest.mark.parametrize("jitter", [0.0, 0.03])
+def test_a_log_whose_steps_recur_says_which_rate_to_give_if_rows_are_missing(pattern, rate, jitter):
+    samples = np.flatnonzero(np.resize(pattern, 6000))
+    samples = samples[(np.arange(samples.size) < 40) | (np.random.default_rng(5).random(samples.size) > 0.002)]  # a few lost beside
+    stamps = stamps_of(samples + np.random.default_rng(3).uniform(-jitter, jitter, len(samples)), rate)
+    (note,) = (note for note in regularise(raw_log(stamps)).attrs["notes"] if "recur" in note)
+    told = note.split("give --rate ")[1]
+    assert float(told) == pytest.approx(rate, rel=1e-3)
+    log = regularise(raw_log(stamps), rate=float(told))
+    assert np.array_equal(log.rate.values[0], expected(samples), equal_nan=True)
+    assert not any("recur" in note for note in log.attrs["notes"])
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        stamps_of(2 * np.arange(6000) + np.random.default_rng(6).integers(0, 2, 6000), 10.0),  # each on time, or late by 0.1 s
+        START + np.floor(np.arange(6000) * 1e3 / 700.0).astype(np.int64) * 1_000_000,  # 700 Hz, written to the millisecond
+        START + np.floor(np.arange(6000) * 1e3 / 60.0).astype(np.int64) * 1_000_000,
+        stamps_of(np.flatnonzero(np.random.default_rng(7).random(6000) > 0.4), 100.0),  # two of five lost, at random
+        stamps_of(np.flatnonzero(np.resize([1, 1, 0], 6000)) / 1.5, 100.0),  # even for a clock that ticks twice in three samples
+    ],
+)
+def test_even_samples_have_no_steps_that_recur(stamps):
+    assert not any("recur" in note for note in regularise(raw_log(stamps)).attrs["notes"])
+
+
 def test_a_multiple_of_the_rate_is_not_taken_for_it():
     with pytest.raises(TimeError, match=r"200 Hz.*100 Hz"):
         regularise(raw_log(stamps_of(np.arange(2000), 100.0)), rate=200.0)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -83,7 +84,7 @@ def _place(
                 f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz; "
                 "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of the time column"
             )
-        rate = declared
+        rate, estimate = declared, replace(estimate, finer=None)  # who gives a rate has decided
     if estimate.counted:
         placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
         odd = []

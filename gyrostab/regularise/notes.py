@@ -53,6 +53,12 @@ def describe_rate(
         why = "many rows share one stamp" if estimate.coarse else "the stamps come in bursts, as rows arrive and not as they are sampled"
         reach = f"; stamps and samples differ by up to {duration(placement.wander / rate)} in the long run" if placement.wander >= 1 else ""
         notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
+    if estimate.finer is not None:
+        notes.append(
+            f"{where}: the steps between stamps recur as if a log at {estimate.finer:g} Hz lost the same rows again and again, or as if "
+            f"rows were read in groups; they are taken for even samples at {rate:.10g} Hz: if rows are missing, "
+            f"give --rate {estimate.finer:g}"
+        )
     off = abs(estimate.raw / rate - 1)
     if off * placement.size > 1 and off > 2 * estimate.stderr / rate:
         notes.append(f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million from {rate:.10g} Hz")

@@ -8,7 +8,7 @@ row's place follows from its stamp. *Counted*: stamps tell when the rows arrived
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.kernels.stamps import NO_STAMP, piece_sums, track
+from gyrostab.regularise.steps import cut, finer_period, refined
 
 __all__ = ["RateEstimate", "Stamps", "estimate_near", "estimate_rate", "odd_stretches", "starting_period"]
 
@@ -45,6 +46,8 @@ class RateEstimate:
         Many rows share one stamp.
     raw : float
         The rate before it was rounded to a plain number [Hz].
+    finer : float or None
+        Rate [Hz] that the stamps would have if the same rows were missing again and again; None where nothing speaks for one.
     """
 
     rate: float
@@ -52,6 +55,7 @@ class RateEstimate:
     counted: bool
     coarse: bool
     raw: float
+    finer: float | None = None
 
 
 def _recut(stamps: Stamps, size: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
@@ -86,10 +90,7 @@ def _pools(stamps: Stamps, *, size: int = 8192, most: int = 64) -> list[NDArray[
 
 def _residual_range(parts: list[NDArray[np.int64]], length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slope [ns a row] and range of the residuals [ns] of straight lines through stretches of `length` stamps."""
-    stride = length if sum(map(len, parts)) > 200 * length else 1  # of a short log, every stretch
-    cut = [np.lib.stride_tricks.sliding_window_view(part, length)[::stride] for part in parts if len(part) >= length]
-    table = np.concatenate([*cut, np.empty((0, length), dtype=np.int64)])
-    values = (table - table[:, :1]).astype(np.float64)
+    values = cut(parts, length)
     x = np.arange(length) - (length - 1) / 2
     slope = values @ x / (x @ x)
     rest = values - slope[:, None] * x
@@ -105,20 +106,6 @@ def _shared(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
     slope, spread = _residual_range(parts, length) if length >= 8 else (np.empty(0), np.empty(0))
     good = slope > 0
     return bool(good.any() and np.median(spread[good] / np.maximum(tick, slope[good])) < 1.3)
-
-
-def _refined(steps: NDArray[np.float64], period: float) -> float:
-    start = period
-    for _ in range(30):
-        near = np.abs(steps) < 5.5 * period
-        count = np.rint(steps[near] / period).sum()
-        if count <= 0 or not 0.3 < period / start < 2.0:  # there is no lattice
-            return start
-        new = float(steps[near].sum() / count)
-        if abs(new - period) < 1e-12 * period:
-            break
-        period = new
-    return period
 
 
 def _misfit(steps: NDArray[np.float64], period: float) -> float:
@@ -155,9 +142,9 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
         return _throughput(parts, ticks=True), True, True
     period = _on_a_line(parts)
     if period is None:
-        period = _refined(steps, float(np.quantile(rising, 0.5, method="lower")))
+        period = refined(steps, float(np.quantile(rising, 0.5, method="lower")))
         if _misfit(steps, period) > 0.2:  # with most rows missing, the median step is not one sample
-            shorter = _refined(steps, float(np.quantile(rising, 0.1)))
+            shorter = refined(steps, float(np.quantile(rising, 0.1)))
             period = shorter if _misfit(steps, shorter) < 0.15 else period
     return (_throughput(parts), True, False) if _bursty(parts, steps, period) else (period, False, False)
 
@@ -315,7 +302,9 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         raise TimeError(f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ")
     period, counted, coarse = starting_period(parts)
     longest = _longest(parts, period) if counted else _sure(len(steps)) * period
-    return _estimate(_pieces(stamps, period, counted, coarse, longest), period, counted, coarse)
+    finer = None if counted else finer_period(parts, period)
+    estimate = _estimate(_pieces(stamps, period, counted, coarse, longest), period, counted, coarse)
+    return estimate if finer is None else replace(estimate, finer=float(f"{SECOND / finer:.4g}"))
 
 
 def _sure(steps: int) -> float:
