@@ -60,6 +60,7 @@ class Accumulator:
         self.cross = np.full((len(self.pairs), blocks, bands), np.nan + 0j)
         self.cross_shape = np.full(self.cross.shape, np.nan)
         self.cross_neighbours = np.full(self.cross.shape[:2], np.nan)
+        self.cross_samples = np.zeros(self.cross.shape[:2], np.int64)
         self.line_sum = np.zeros((self.axes, PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, PARTS, 2))
@@ -139,6 +140,7 @@ class Accumulator:
             differ &= used[a] & used[b]
             self.cross_shape[number, part] = self.shape[a, part]
             self.cross_neighbours[number, part] = self.neighbours[a, part]
+            self.cross_samples[number, part] = both
             if differ.any():
                 both_there = (present[a] & present[b])[differ]
                 cross[differ], self.cross_shape[number, part][differ] = self._jointly(centred[[a, b]][:, differ], both_there)
