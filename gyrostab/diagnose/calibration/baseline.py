@@ -7,26 +7,22 @@ is kept as draws, so that null records carry the error of the calibration.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.calibration.expected import NOISE, band_columns, common_variance, noise_powers, white_variance
+from gyrostab.diagnose.calibration.expected import NOISE, common_variance, noise_powers, white_variance
+from gyrostab.diagnose.calibration.known import known_effects
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
 from gyrostab.diagnose.calibration.quiet import loudness, quiet_blocks, quiet_spans
-from gyrostab.diagnose.effects.candidates import windows_of
-from gyrostab.diagnose.effects.cells import effective
-from gyrostab.diagnose.effects.response import response_of
 from gyrostab.diagnose.gains.products import mean_products
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import HOUR, LAWS, TERMS
-from gyrostab.physics.base import Effect, driver_error
 from gyrostab.simulate.model import Model, read_model
 
-__all__ = ["DRAWS", "assemble", "calibrate", "drivers_of", "from_model", "from_simulation", "grid_values", "known_effects"]
+__all__ = ["DRAWS", "assemble", "calibrate", "from_model", "from_simulation", "grid_values"]
 
 Array = NDArray[np.float64]
 #: Draws from the posterior of the noise of an axis.
@@ -248,7 +244,8 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        As `calibrate` has it; the noise has no error. ``attrs["left_out"]`` names the effects that show elsewhere too (in
+        As `calibrate` has it; the noise has no error. With ``cross(pair, block, band)``, the expected cross-spectrum, where axes share
+        an effect of the model. ``attrs["left_out"]`` names the effects that show elsewhere too (in
         distributions, transfers, orders of the rotation, random wander): that part of them is not in it.
 
     Raises
@@ -269,12 +266,14 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
         draws = np.tile(square, (DRAWS, 1))
         K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
         found.append(Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True))
-    mean, spectrum, left_out = known_effects(reduced, made, np.stack([one.square for one in found]))
+    known = known_effects(reduced, made, np.stack([one.square for one in found]))
     hours = (reduced["begin"].values + reduced["end"].values) / (2.0 * HOUR)
     ramp = np.array([made.coefficients(axis)["R"] for axis in axes])
-    attrs = {"source": "model", "calibrated_on": [], "model": made.source, "left_out": left_out}
+    attrs = {"source": "model", "calibrated_on": [], "model": made.source, "left_out": known.left_out}
     quiet = np.ones((len(axes), reduced.sizes["block"]), np.bool_)
-    out = assemble(reduced, found, quiet=quiet, attrs=attrs, known_mean=mean + ramp[:, None] * hours, spectrum=spectrum)
+    out = assemble(reduced, found, quiet=quiet, attrs=attrs, known_mean=known.mean + ramp[:, None] * hours, spectrum=known.spectrum)
+    if known.cross is not None:
+        out["cross"] = (("pair", "block", "band"), known.cross, {"long_name": "expected cross-spectrum", "units": _POWER})
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"][:] = 0.0
     return out
@@ -313,54 +312,3 @@ def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset) -> xr.Dataset:
     spectrum = np.einsum("abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found])) * level[..., None]
     attrs = {"source": "simulation", "calibrated_on": quiet_spans(simulated, chosen), "quiet_by": reason}
     return assemble(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum)
-
-
-def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> tuple[Array, Array, list[str]]:
-    """What the effects of a model make of the record: means (axis, block), band powers (axis, block, band), and the effects left out.
-
-    Parameters
-    ----------
-    reduced : xarray.Dataset
-    model : Model
-    square : ndarray, shape (axis, 4)
-        Squared noise coefficients.
-    """
-    axes = [str(axis) for axis in reduced["axis"].values]
-    blocks, bands = reduced.sizes["block"], reduced.sizes["band"]
-    mean, level = np.zeros((len(axes), blocks)), np.repeat(square[:, None], blocks, axis=1)
-    added, response, left_out = np.zeros((len(axes), blocks, bands)), np.ones((len(axes), 1, bands)), []
-    for effect in model.effects:
-        rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
-        drivers = drivers_of(effect)
-        present = [str(name).removeprefix("channel_") for name in reduced.data_vars if str(name).startswith("channel_")]
-        for role, name in drivers.items():
-            if name not in present:
-                raise driver_error(effect, role, present)
-        windows = replace(windows_of(reduced, drivers), axes=tuple(axes[row] for row in rows))
-        seen = effect.explain(windows)
-        for name, values in seen.mean.items():
-            mean[rows] += _sizes(effect, name, windows.axes)[:, None] * values
-        for (term, name), values in seen.level.items():
-            level[rows, :, NOISE.index(term)] += (
-                square[rows, None, NOISE.index(term)] * _sizes(effect, name, windows.axes)[:, None] * values
-            )
-        for name, values in seen.spectrum.items():
-            added[rows] += _sizes(effect, name, windows.axes)[:, None, None] ** 2 * values
-        if seen.response is not None:
-            response[rows] *= response_of(effect, reduced)
-        elsewhere = seen.marks or seen.wander or seen.transfer or seen.order or seen.phase_locked
-        if elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None):
-            left_out.append(effect.name)
-    density = (np.einsum("fn,abn->abf", band_columns(reduced), np.maximum(level, 0.0)) + added) * response
-    return mean, effective(density, reduced), left_out
-
-
-def drivers_of(effect: Effect) -> dict[str, str]:
-    """Channel of the effect -> its name in the log."""
-    return {role: effect.channel_names()[role] for role in effect.needs()}
-
-
-def _sizes(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
-    """A parameter for each axis."""
-    known = {one.name: one for one in effect.parameters()}
-    return effect.each(name, axes) if known[name].many else np.full(len(axes), float(getattr(effect, name)))

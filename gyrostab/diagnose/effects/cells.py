@@ -19,9 +19,22 @@ from gyrostab.diagnose.gains.gain import Cells, independent, noise_columns
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.kernels.periodogram import taper
 
-__all__ = ["State", "begin_state", "cells_of", "cross_column", "drawn", "effective", "in_place", "pair_rows", "view_rows", "witness_power"]
+__all__ = [
+    "State",
+    "begin_state",
+    "cells_of",
+    "cross_column",
+    "drawn",
+    "effective",
+    "in_place",
+    "known_cross",
+    "pair_rows",
+    "view_rows",
+    "witness_power",
+]
 
 Array = NDArray[Any]
+_LEAST_SHARE = 0.05  # of the variance of a cross-spectrum, that is left beside the phase of what is shared
 
 
 @dataclass(frozen=True)
@@ -176,14 +189,21 @@ def cross_column(density: Array, row: int, reduced: xr.Dataset) -> Array:
     return np.asarray(np.broadcast_to(effective(density + 0j, reduced, "pair"), shape)[row])
 
 
+def known_cross(baseline: xr.Dataset) -> Array | None:
+    """Cross-spectra that the baseline expects, (pair, block, band); None where it expects nothing of them."""
+    return np.asarray(baseline["cross"].transpose("pair", "block", "band").values) if "cross" in baseline else None
+
+
 def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
     pair = pair_rows(state.reduced)[row]
     i, j = (state.axes.index(axis) for axis in pair)
-    values = _records(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row]
+    known = known_cross(state.baseline)
+    shared = known[row] if known is not None else np.zeros(1)
+    values = _records(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row] - shared[..., None]
     shape = state.reduced["cross_shape"].transpose("pair", "block", "band").values[row]
-    weight = 2.0 * shape / (state.weight[i] * state.weight[j])
+    alone, apart = state.weight[i] * state.weight[j], (shared**2).real  # in phase with what is shared the scatter is larger, beside it less
+    weight = np.concatenate([2.0 * shape / (alone + apart), 2.0 * shape / np.maximum(alone - apart, _LEAST_SHARE * alone)], axis=1)
     weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
-    weight = np.concatenate([weight, weight], axis=1)
     given, precision = _beside(state, "cross", pair, weight.shape)
     designs = [
         _spread([_parts(cross_column(one, row, state.reduced)) for one in variant.design], weight.shape)
@@ -269,12 +289,17 @@ def _profile(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state:
 # ------------------------------------------------------------------------------------------------------------- transfers
 
 
-def witness_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset) -> tuple[Array, Array]:
-    """Cross-power of an axis with a channel or another axis, (block, band, record), and the power of that, (block, band)."""
+def witness_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset, baseline: xr.Dataset) -> tuple[Array, Array]:
+    """Cross-power of an axis with a channel or another axis, (block, band, record), and the power of that, (block, band).
+
+    What both axes are known to share is taken off.
+    """
     axes = [str(one) for one in reduced["axis"].values]
     if name in axes:
         cross = _records(measured(data, "cross").transpose(..., "pair", "block", "band").values, 3)
         there = np.isfinite(reduced["power"].values[row])[..., None]
+        known = known_cross(baseline)
+        cross = cross if known is None else cross - known[..., None]
         found = np.full(cross.shape[1:], np.nan + 0j)
         for number, pair in enumerate(pair_rows(reduced)):
             if set(pair) == {name, axes[row]} and name != axes[row]:
@@ -293,7 +318,7 @@ def witness_power(name: str, reduced: xr.Dataset) -> Array:
 
 
 def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
-    cross, power = witness_of(candidates[0].witness[0], row, data, state.reduced)
+    cross, power = witness_of(candidates[0].witness[0], row, data, state.reduced, state.baseline)
     root = np.sqrt(np.where(power > 0.0, power, np.nan))
     weight = 2.0 * state.reduced["shape"].values[row] / state.weight[row]
     weight = np.where(np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0)

@@ -115,7 +115,14 @@ def _cross(state: State, part: Part) -> State:
     for one in part.variant.design:
         chosen = cross_column(one, row, state.reduced)
         columns.append(np.concatenate([chosen.real, chosen.imag], axis=-1))
-    return state.with_columns("cross", ",".join(part.row), columns)
+    state = state.with_columns("cross", ",".join(part.row), columns)
+    if state.baseline.attrs.get("source", "calibrated") == "calibrated" or not part.variant.squared:
+        return state  # what was calibrated on the recording has the power of all that its axes share
+    for axis in part.row:
+        powers = [power_column(one.real, state.axes.index(axis), state) for one in part.variant.design]
+        known = state.given.get(("power", axis), [])
+        state = state.with_columns("power", axis, [one for one in powers if not any(np.array_equal(one, other) for other in known)])
+    return state
 
 
 def _coherent(state: State, axes: tuple[str, ...], density: Array) -> State:

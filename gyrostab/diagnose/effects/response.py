@@ -15,10 +15,10 @@ from gyrostab.diagnose.gains.lines import local_level
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 
-__all__ = ["is_filter", "response_of", "straightened"]
+__all__ = ["inside_bands", "is_filter", "response_of", "straightened"]
 
 Array = NDArray[np.float64]
-_INSIDE = 24  # frequencies in a band
+_INSIDE = 48  # frequencies in a band
 _SHARES, _PASSED = 50, 0.002  # sizes that are tried; least share that a filter of full form lets pass by
 _LOUD = 3.0  # times the level about, beyond which a line is cut
 _STOPPED = 0.05  # of the largest response, below which what is seen is leakage from elsewhere
@@ -40,10 +40,14 @@ def is_filter(view: str, variant: Variant) -> bool:
 
 def response_of(effect: Effect, reduced: xr.Dataset) -> Array:
     """Factor of the noise in the bands: the mean over the frequencies of each, for a filter is steep."""
+    return np.asarray(_response(effect, reduced, inside_bands(reduced)).reshape(-1, _INSIDE).mean(axis=1))
+
+
+def inside_bands(reduced: xr.Dataset) -> Array:
+    """Frequencies evenly inside of every band, as many in each, one band after the other [Hz]."""
     low, high = reduced["band_low"].values, reduced["band_high"].values
     place = (np.arange(_INSIDE) + 0.5) / _INSIDE
-    frequency = (low[:, None] + (high - low)[:, None] * place).ravel()
-    return np.asarray(_response(effect, reduced, frequency).reshape(low.size, _INSIDE).mean(axis=1))
+    return np.asarray((low[:, None] + (high - low)[:, None] * place).ravel())
 
 
 def _response(effect: Effect, reduced: xr.Dataset, frequency: Array) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from gyrostab.diagnose.calibration.expected import line_columns, white_variance
+from gyrostab.diagnose.locating.shared import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.outliers import beyond_chance
 from gyrostab.kernels.periodogram import taper
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times
@@ -39,6 +40,7 @@ class _Frame(NamedTuple):
     effects: Array  # expected power over that of the noise alone
     sd: Array  # of a sample and of the difference of two neighbours, by axis
     tails: Array  # excess kurtosis of a block beyond that of white Gaussian noise, and its scatter over that one's, by axis
+    shared: Shared | None  # what axes have in common
 
 
 def null_records(
@@ -94,7 +96,7 @@ def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) 
         sd.append([np.sqrt(level) for level in (_variance(reduced, density), 2.0 * _variance(reduced, density, difference=True))])
     tails = np.array([_tails(reduced, lines * square, rng) for square in baseline["square"].values])
     shape = _ordered(reduced, "shape", "axis", "block", "band")
-    return _Frame(reduced, baseline, shape, columns, effects, np.array(sd), tails)
+    return _Frame(reduced, baseline, shape, columns, effects, np.array(sd), tails, shared_by(reduced, baseline))
 
 
 def _tails(reduced: xr.Dataset, density: Array, rng: np.random.Generator) -> tuple[float, float]:
@@ -127,16 +129,24 @@ def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
     squares = np.stack([baseline["posterior"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1)
     slow = np.stack([baseline["posterior_slow"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1)
     expected = np.einsum("abfn,ran->rabf", frame.columns, squares) * frame.effects
-    power = _gamma(baseline["shape_alone"].values, expected, rng)
+    if frame.shared is None:
+        power, between = _gamma(baseline["shape_alone"].values, expected, rng), np.empty(0, np.complex128)
+    else:
+        power, between = shared_spectra(frame.shared, count, rng)
+        power *= expected
     common = baseline["common"].values
-    power *= _gamma(np.where(common > 0.0, 1.0 / np.where(common > 0.0, common, 1.0), np.inf), np.ones(power.shape[:3]), rng)[..., None]
+    swell = _gamma(np.where(common > 0.0, 1.0 / np.where(common > 0.0, common, 1.0), np.inf), np.ones(power.shape[:3]), rng)[..., None]
+    power *= swell
     power[..., np.isnan(_ordered(reduced, "power", "axis", "block", "band"))] = np.nan
     found: dict[str, Any] = {
         "mean": (("axis", "block"), _means(frame, squares, slow, rng)),
         "power": (("axis", "block", "band"), power),
         "line_power": (("axis", "part", "line"), _lines(frame, squares, rng)),
         "kurtosis": (("axis", "block"), _kurtosis(frame, count, rng)),
-        "cross": (("pair", "block", "band"), _cross(frame, power, rng)),
+        "cross": (
+            ("pair", "block", "band"),
+            _cross(frame, power, rng) if frame.shared is None else _crossed(frame, expected * swell, between),
+        ),
     }
     found |= {name: (("axis", "block"), values) for name, values in _counts(frame, count, rng).items()}
     if "witness_cross" in reduced:
@@ -164,7 +174,8 @@ def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator)
     level = np.divide(drawn, usual, out=np.ones_like(drawn), where=np.broadcast_to(usual > 0.0, drawn.shape))  # an axis may have neither
     white = np.sqrt(_ordered(baseline, "mean_variance", "axis", "block") * level)
     times = flicker_times(1.0 / step, low=1.0 / (2.0 * np.pi * 8.0 * n * step))
-    total = _ordered(baseline, "known_mean", "axis", "block") + white * rng.standard_normal(white.shape)
+    drawn = rng.standard_normal(white.shape) if frame.shared is None else shared_white(frame.shared, len(white), rng)
+    total = _ordered(baseline, "known_mean", "axis", "block") + white * drawn
     for place in np.ndindex(*white.shape[:2]):
         B2, K2 = slow[place]
         flicker, _ = flicker_means(rng.standard_normal((n, times.size + 1)), times, 1.0 / step, rng.standard_normal(times.size))
@@ -224,6 +235,15 @@ def _cross(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[np.
     if "cross_shape" in frame.reduced:
         shape = _ordered(frame.reduced, "cross_shape", "pair", "block", "band")
     cross = size * _coherency(shape, size.shape, rng)
+    cross[..., np.isnan(_ordered(frame.reduced, "cross", "pair", "block", "band"))] = np.nan
+    return np.asarray(cross)
+
+
+def _crossed(frame: _Frame, level: Array, between: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Cross-spectra of axes that share something, from those over the levels of both."""
+    assert frame.shared is not None
+    one, other = ([pair[side] for pair in frame.shared.pairs] for side in (0, 1))
+    cross = between * np.sqrt(level[:, one] * level[:, other])
     cross[..., np.isnan(_ordered(frame.reduced, "cross", "pair", "block", "band"))] = np.nan
     return np.asarray(cross)
 

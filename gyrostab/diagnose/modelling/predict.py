@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.effects.cells import State, begin_state, cross_column, pair_rows
+from gyrostab.diagnose.effects.cells import State, begin_state, cross_column, known_cross, pair_rows
 from gyrostab.diagnose.effects.explained import Part, explain_away
 from gyrostab.diagnose.effects.sizes import mean_mixture, part_mixture
 from gyrostab.diagnose.naming.claims import Naming
@@ -56,7 +56,11 @@ def predicted(naming: Naming, baseline: xr.Dataset, known: NDArray[np.bool_] | N
         known_mean=baseline["known_mean"].transpose("axis", "block").copy(data=mean),
     )
     shared = [part for claim in naming.claims for part in claim.parts if part.candidate.view == "cross"]
-    return after.assign(cross=(("pair", "block", "band"), _shared(shared, state, naming))) if shared else after
+    if not shared:
+        return after
+    known = known_cross(baseline)
+    cross = _shared(shared, state, naming)
+    return after.assign(cross=(("pair", "block", "band"), cross if known is None else cross + known))
 
 
 def _shared(parts: Sequence[Part], state: State, naming: Naming) -> NDArray[np.complex128]:
