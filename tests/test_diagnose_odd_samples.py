@@ -39,6 +39,7 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
         ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {}),
         ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {"axes": "x"}),
         ({"name": "clipping", "limit": 0.6, "axes": ["y"]}, {}),
+        ({"name": "clipping", "limit": 1.75, "axes": ["y"]}, {}),  # seven samples of 15 000
     ],
     ids=lambda value: "-".join(map(str, value.values())),
 )
@@ -67,3 +68,16 @@ def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
     assert (claim.effect, claim.axes) == ("spikes", ("y",))
     (fitted,) = fit_claims(found, baseline)
     assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0
+
+
+def test_noise_that_rises_within_a_block_is_no_outlier_beside_spikes_of_another_axis():
+    rng = np.random.default_rng(6)
+    loud = (np.arange(15_000) >= 5_000 + 81) & (np.arange(15_000) < 10_000)
+    noise = SCATTER * rng.standard_normal((3, 15_000)) * np.where(loud, 5.0, 1.0)
+    noise[1, rng.choice(5_000, 12, replace=False)] += 30.0
+    log = make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz"), channels={"vibration": (3.0 * loud, "g")})
+    reduced = reduce_log(log)
+    baseline, records = nulls(reduced, 40)
+    axes = {claim.effect: claim.axes for claim in name_effects(reduced, baseline, records).claims}
+    assert axes.pop("spikes") == ("y",)
+    assert list(axes.values()) == [("x", "y", "z")]  # of what vibration does

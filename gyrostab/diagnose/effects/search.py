@@ -18,6 +18,7 @@ from gyrostab.diagnose.gains.lines import expected_lines, line_gains
 from gyrostab.diagnose.gains.tallies import (
     OF_LATTICE,
     Expected,
+    beyond_ends,
     coarse_lattice,
     count_gains,
     expected_counts,
@@ -204,6 +205,7 @@ def _mark(name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_],
         return np.zeros((records, len(state.axes)))
     values = data[name].transpose(..., "axis", "block").values.astype(np.float64)
     values = values if values.ndim == 3 else values[None]
+    values = beyond_ends(values) if name == "extremes" else values
     how = kurtosis_gains if name == "kurtosis" else count_gains
     return how(values, *tallies.of[name], subsets)
 

@@ -14,6 +14,7 @@ __all__ = [
     "COUNTS",
     "OF_LATTICE",
     "Expected",
+    "beyond_ends",
     "coarse_lattice",
     "count_gains",
     "expected_counts",
@@ -27,6 +28,7 @@ COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
 #: Statistics of the distribution that a coarse lattice makes by itself.
 OF_LATTICE = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
 _COARSE, _STILL = 0.2, 0.1  # step in scatters of the samples; share of the blocks that tell the scatter at rest
+_ENDS = 2  # samples that are the smallest and the largest of any record
 _SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
 
 
@@ -61,6 +63,30 @@ def still_scatter(reduced: xr.Dataset) -> NDArray[np.float64]:
     return np.sqrt([np.quantile(row[np.isfinite(row)], _STILL) if np.isfinite(row).any() else np.inf for row in square])
 
 
+def beyond_ends(values: NDArray[Any]) -> NDArray[Any]:
+    """Samples at the ends of the range, less the first two of the record: one at either end is what any record has.
+
+    A count of which two are certain has no Poisson law: without a lattice chance never brings a third one.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., block)
+        Samples equal to the smallest or largest of the record.
+
+    Returns
+    -------
+    ndarray, shape (..., block)
+
+    Examples
+    --------
+    >>> beyond_ends(np.array([[0, 1, 0, 1], [1, 3, 0, 2]]))
+    array([[0, 0, 0, 0],
+           [0, 2, 0, 2]])
+    """
+    beyond = np.maximum(np.cumsum(values, axis=-1) - _ENDS, 0)
+    return np.asarray(np.diff(beyond, axis=-1, prepend=0))
+
+
 class Expected:
     """Mean and overdispersion of the counts of null records, by axis, gathered chunk by chunk."""
 
@@ -71,7 +97,8 @@ class Expected:
         """Take in some null records."""
         for name in self.sums:
             if name in nulls:
-                self.sums[name].append(nulls[name].transpose("record", "axis", "block").values.astype(np.float64))
+                values = nulls[name].transpose("record", "axis", "block").values.astype(np.float64)
+                self.sums[name].append(beyond_ends(values) if name == "extremes" else values)
 
     def blocks(self, name: str) -> Array:
         """(record, axis, block)."""
