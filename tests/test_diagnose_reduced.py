@@ -441,3 +441,12 @@ def test_progress_reaches_its_end():
     told = []
     reduce_log(log_of(np.random.default_rng(0).standard_normal((3, 50_000))), progress=lambda *given: told.append(given))
     assert told[-1][2] == told[-1][1] > 0.98 * 3 * 50_000
+
+
+def test_the_lattice_shows_where_spikes_off_it_are_as_common_as_its_rare_levels():
+    rng = np.random.default_rng(9)
+    values = np.round(rng.standard_normal(4000) / 0.1) * 0.1
+    off = np.concatenate([values[:12] + 7.03, np.full(8, 6.777)])
+    assert lattice_step(np.concatenate([values, off])) == pytest.approx(0.1, rel=1e-9)
+    half = np.where(np.arange(4000) < 2000, values, rng.standard_normal(4000))  # half of the values have none
+    assert lattice_step(half) == 0.0

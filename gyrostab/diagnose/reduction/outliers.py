@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 _SIGMA = 6.0
 _CLEAR = 64.0  # a lattice is as many times coarser than the last digit
 _RARE = 0.01  # of the values, which may stand off a lattice that is coarse
+_TAILS = 0.1  # of the values, where spikes may be as common as those of the lattice
 _NEAR = 2  # blocks on either side that help to tell a block's own noise
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
@@ -147,20 +148,33 @@ def lattice_step(values: Array) -> float:
     if finite.size < 32:
         return 0.0
     levels, times = np.unique(finite, return_counts=True)
-    order = np.argsort(times, kind="stable")
-    common = np.sort(order[np.cumsum(times[order]) > _RARE * finite.size])
-    if common.size and times[common].min() > 1:  # a coarse lattice: the rarest values may be spikes, off that of the others
-        levels = levels[common]
     size = float(np.abs(levels).max())
-    for resolution in (2.0**-23, 2.0**-52):  # as written in single and in double precision
-        fine = 8.0 * resolution * size
-        apart = np.diff(levels)
-        apart = apart[apart > fine]
-        if 0 < apart.size <= 0.8 * finite.size:
-            step = _common(apart, fine)
-            if step > 0.0:
-                return step
+    kept = [_common_levels(levels, times, rare) for rare in (_RARE, _TAILS)]
+    for several in (one for one in kept if one.size) if kept[0].size else (levels,):
+        for resolution in (2.0**-23, 2.0**-52):  # as written in single and in double precision
+            fine = 8.0 * resolution * size
+            apart = np.diff(several)
+            apart = apart[apart > fine]
+            if 0 < apart.size <= 0.8 * finite.size:
+                step = _common(apart, fine)
+                if step > 0.0 and (several is levels or _share_off(levels, times, step, fine) <= _RARE):
+                    return step
     return 0.0
+
+
+def _common_levels(levels: Array, times: NDArray[np.int64], rare: float) -> Array:
+    """Levels without the rarest, which hold this share of the values: spikes, off the lattice; empty where those left are no coarse one."""
+    order = np.argsort(times, kind="stable")
+    common = np.sort(order[np.cumsum(times[order]) > rare * times.sum()])
+    return levels[common] if common.size and times[common].min() > 1 else levels[:0]
+
+
+def _share_off(levels: Array, times: NDArray[np.int64], step: float, fine: float) -> float:
+    """Share of the values that do not stand on the lattice of this step on which the most common one stands."""
+    away = np.abs(levels - levels[times.argmax()]) / step
+    whole = np.round(away)
+    off = np.abs(away - whole) * step > 2.0 * fine * (1.0 + whole)
+    return float(times[off].sum() / times.sum())
 
 
 def _common(apart: Array, fine: float) -> float:
