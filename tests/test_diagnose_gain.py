@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.search import gains, totals
 from gyrostab.diagnose.gains.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.gains.gain import mean_factors, mean_gains, noise_columns, power_factors, power_gains, score
 from gyrostab.diagnose.gains.products import WIDTHS
+from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.state_space import flicker_states
+from gyrostab.log import make_log
 from gyrostab.noise import HOUR
 from tests.test_state_space import relaxation_covariance, walk_covariance
 
@@ -258,3 +265,31 @@ def test_many_records_take_seconds():
     mean_gains(data, baseline, means, axis="x")
     power_gains(power, level, powers, axis="x")
     assert time.process_time() - begin < 10.0
+
+
+def test_a_spectrum_that_falls_is_no_quantization_of_negative_power():
+    """A mean of two neighbours takes ``4 a (1 - a) sin^2(pi f / fs)`` off, the form of Q: but the square of Q ends at zero."""
+    raw = np.random.default_rng(12).standard_normal((1, 20_001))
+    reduced = reduce_log(make_log(0.9 * raw[:, 1:] + 0.1 * raw[:, :-1], rate=10.0, unit="deg/h"))
+    baseline = calibrate(reduced)
+    design = [np.tile(np.sin(np.pi * reduced["frequency"].values / 10.0) ** 2, (reduced.sizes["block"], 1))]
+    found = power_factors(reduced, baseline, design, axis="x")[0, 1, 0]
+    beside_any = power_factors(reduced, baseline.drop_vars("posterior"), design, axis="x")[0, 1, 0]
+    assert found > 20.0
+    assert found > 1.3 * beside_any
+    assert np.diagonal(noise_columns(baseline, axis="x")[1])[0] > 2.0 / baseline["square_stderr"].sel(noise="Q").item() ** 2
+
+
+@pytest.mark.parametrize(("share", "least", "most"), [(0.0, -np.inf, 2.0), (0.06, 10.0, np.inf)])
+def test_a_weak_filter_gains_more_than_noise_reaches(share, least, most):
+    """Six per cent of every sample come late: the spectrum falls by a quarter towards its end."""
+    raw = np.random.default_rng(12).standard_normal((2, 15_001))
+    reduced = reduce_log(make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h"))
+    baseline = calibrate(reduced)
+    filters = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == "logger_filter"]
+    (noise,) = null_records(reduced, baseline, count=200, rng=np.random.default_rng(3), chunk=200)
+    start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
+    (found,) = totals(gains(filters, reduced, start, folds)).values()
+    (drawn,) = totals(gains(filters, noise, start, folds, rng=np.random.default_rng(1))).values()
+    assert least < found[0] < most
+    assert np.quantile(drawn, 0.99) < 5.0

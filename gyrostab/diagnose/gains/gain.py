@@ -142,7 +142,8 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
     """Relative change of the spectrum by constant changes of the noise coefficients, and the precision of its prior.
 
     N may take any value in the tier "free"; Q changes by its value and error, B and K by three times that, because the spectrum cannot
-    fall below what the other terms leave. In the tier "calibrated" all change by their errors.
+    fall below what the other terms leave. The error of Q is that of its posterior, which ends at zero: a spectrum that falls towards its
+    end, as a filter makes it, is no Q. In the tier "calibrated" all change by their errors.
 
     Returns
     -------
@@ -158,6 +159,9 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
     if tier == "free":
         names = [str(name) for name in baseline["noise"].values]
         freedom = np.array([{"Q": 1.0, "N": 1e3, "B": 3.0, "K": 3.0}[name] for name in names])
+        if "posterior" in baseline:
+            within = baseline["posterior"].sel(axis=axis).transpose("draw", "noise").values.std(axis=0)
+            error = np.where(np.array(names) == "Q", np.minimum(error, within), error)
         error = freedom * np.hypot(square, error)
     free = error > 0.0
     return columns[..., free], np.diag(1.0 / np.square(error[free]))
