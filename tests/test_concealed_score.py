@@ -323,3 +323,21 @@ def test_a_claim_without_a_gain_comes_last():
     row = one(diagnosis(bare, claim("shupe", nats=6.0)), truth("shupe"))
     assert row["named"]
     assert math.isfinite(row["gain"])
+
+
+def test_what_was_alone_what_was_named_whole_and_what_is_no_shared_source_are_counted_apart():
+    number = {"value": 0.5, "stderr": 0.1, "unit": "deg/h/g^2"}
+    sure, off = number | {"low": 0.3, "high": 0.7}, number | {"low": 0.1, "high": 0.3}
+    alone = score_case(diagnosis(), truth("shupe", index=1))
+    both = score_case(
+        diagnosis(claim("shared_source", parameters={"sensitivity": off}), claim("shupe", parameters={"sensitivity": sure}), gain=16.0),
+        truth("shared_source", "shupe", kind="pair", index=2),
+    )
+    half = score_case(diagnosis(claim("shupe"), gain=4.0), truth("shupe", "spikes", kind="pair", index=3))
+    table = score_table([*alone, *both, *half]).set_index("quantity")
+    assert table.loc["detected at 1.5 times the limit and more", ["value", "n"]].tolist() == [0.8, 5]
+    assert table.loc["detected, of those that were alone", ["value", "n"]].tolist() == [0.0, 1]
+    assert table.loc["95 % intervals that hold the truth", ["value", "n"]].tolist() == [0.5, 2]
+    assert table.loc["of those, without the shared source", ["value", "n"]].tolist() == [1.0, 1]
+    assert table.loc["gain over the oracle's, median", ["value", "n"]].tolist() == [0.5, 2]
+    assert table.loc["gain over the oracle's where all was named rightly, median", ["value", "n"]].tolist() == [0.8, 1]
