@@ -72,8 +72,8 @@ def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
 
 def test_noise_that_rises_within_a_block_is_no_outlier_beside_spikes_of_another_axis():
     rng = np.random.default_rng(6)
-    loud = (np.arange(15_000) >= 5_000 + 81) & (np.arange(15_000) < 10_000)
-    noise = SCATTER * rng.standard_normal((3, 15_000)) * np.where(loud, 5.0, 1.0)
+    loud = (np.arange(15_000) >= 31 * 162 + 120) & (np.arange(15_000) < 62 * 162 + 40)  # ends in the quiet half of a block
+    noise = SCATTER * rng.standard_normal((3, 15_000)) * np.where(loud, 8.0, 1.0)
     noise[1, rng.choice(5_000, 12, replace=False)] += 30.0
     log = make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz"), channels={"vibration": (3.0 * loud, "g")})
     reduced = reduce_log(log)

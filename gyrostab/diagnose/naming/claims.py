@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,9 +14,9 @@ from gyrostab.diagnose.effects.cells import State
 from gyrostab.diagnose.effects.designs import Candidate
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.search import Tallies
-from gyrostab.diagnose.naming.parts import axes_of, gain_sum
+from gyrostab.diagnose.naming.parts import LEAST, axes_of, gain_sum
 
-__all__ = ["Claim", "Naming", "Unknown", "form_error", "unknown_of", "with_claim"]
+__all__ = ["Claim", "Naming", "Unknown", "form_error", "unknown_of", "with_axes_of", "with_claim"]
 
 Array = NDArray[np.float64]
 #: What an error of the spectrum of a driven noise leaves to a filter, as a share of its gain: 0.08 was seen in loud vibration.
@@ -131,6 +131,13 @@ def with_claim(chosen: Sequence[Claim | Unknown], one: Claim | Unknown) -> list[
             both = replace(other, axes=axes, parts=(*other.parts, *one.parts), gain=other.gain + one.gain, alternatives=alike)
             return [*chosen[:place], both, *chosen[place + 1 :]]
     return [*chosen, one]
+
+
+def with_axes_of(claim: Claim, again: Mapping[str, Sequence[Part]]) -> Claim:
+    """A claim without the axes on which it no longer brings anything, by its parts that were found with the others in the model."""
+    seen = {axis for part in again.get(claim.parts[0].candidate.key, []) if part.gain > LEAST for axis in part.row}
+    kept = tuple(part for part in claim.parts if set(part.row) <= seen)
+    return replace(claim, parts=kept, axes=tuple(axis for axis in claim.axes if axis in seen)) if kept else claim
 
 
 def _same(one: Claim, other: Claim) -> bool:

@@ -18,9 +18,10 @@ from gyrostab.diagnose.effects.generics import generic_candidates
 from gyrostab.diagnose.effects.search import Found, Tallies, gains, totals
 from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.gains.tallies import Expected
-from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown, form_error, unknown_of, with_claim
+from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown, form_error, unknown_of, with_axes_of, with_claim
 from gyrostab.diagnose.naming.complete import flexible, redness, unrest
 from gyrostab.diagnose.naming.filters import without_slopes
+from gyrostab.diagnose.naming.layers import found_again, layers
 from gyrostab.diagnose.naming.levels import followed_first, renewed
 from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, parts_of, tried_again, without_lines
 from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural
@@ -184,7 +185,10 @@ class _Search:
         return {other.key for other in self.candidates if other.view == "marks" and marks & set(other.marks)}
 
     def _gains(self, state: State) -> list[Found]:
-        return gains(self.candidates, state.reduced, state, self.folds, tallies=self.tallies)
+        return self._of(self.candidates, state)
+
+    def _of(self, candidates: Sequence[Candidate], state: State) -> list[Found]:
+        return gains(candidates, state.reduced, state, self.folds, tallies=self.tallies)
 
     def _ranked(self, state: State, barred: set[str]) -> list[Found]:
         """Gains of all that is not barred, with weights that suit the best in the powers: what is loud is loud in every view."""
@@ -263,14 +267,17 @@ class _Search:
         return state
 
     def _pruned(self, start: State, chosen: list[Claim | Unknown]) -> list[Claim | Unknown]:
-        """Without what no longer passes when the others are in, the weakest first."""
+        """Without what no longer passes when the others are in, the weakest first; and claims only on axes that still show them."""
         for one in sorted(chosen, key=lambda one: (isinstance(one, Claim), one.gain)):  # what has no name the first
-            if len(chosen) < 2 or (one is chosen[0] and isinstance(one, Claim)):
-                continue
+            if len(chosen) < 2:
+                break
             state = self._with(start, chosen, one)
             again = by_key(gains(tried_again(one.parts), state.reduced, state, self.folds, tallies=self.tallies))
-            if max((gain_sum(parts) for parts in again.values()), default=0.0) < self.threshold:
+            leading = one is chosen[0] and isinstance(one, Claim)
+            if not leading and max((gain_sum(parts) for parts in again.values()), default=0.0) < self.threshold:
                 chosen = [other for other in chosen if other is not one]
+            elif isinstance(one, Claim):
+                chosen = [with_axes_of(one, again) if other is one else other for other in chosen]
         return chosen
 
     def _settled(self, start: State, chosen: list[Claim | Unknown]) -> tuple[list[Claim | Unknown], list[Claim]]:
@@ -298,7 +305,8 @@ class _Search:
         axes = set(claim.axes)
         mine = {key: [one for one in several if set(one.row) & axes] for key, several in parts.items()}
         key = claim.parts[0].candidate.key
-        gain = gain_sum(mine.get(key, [])) or claim.gain
+        again = found_again(claim.parts, mine.get(key, []), replace(state, weight=weight), self._of)
+        gain = sum(max(gain_sum(one), 0.0) for one in again) or claim.gain
         rivals = [
             several[0].candidate.effect
             for other, several in mine.items()
@@ -311,8 +319,8 @@ class _Search:
         lines = {part.place for other in chosen for part in other.parts if part.candidate.effect == PLAIN_LINE}
         rivals += structural(claim.effect, claim.parts, state, lines=len(lines))
         others = tuple(dict.fromkeys(name for name in [*claim.alternatives, *rivals] if name != claim.effect))
-        fresh = tuple(renewed(mine.get(key, []), part) for part in claim.parts)
-        return replace(claim, gain=gain, alternatives=others, parts=fresh)
+        fresh = [renewed(found, part) for layer, found in zip(layers(claim.parts), again, strict=True) for part in layer]
+        return replace(claim, gain=gain, alternatives=others, parts=tuple(fresh))
 
     def _complete(self, start: State, state: State, claims: list[Claim], unknown: Sequence[Unknown]) -> tuple[list[Claim], list[Unknown]]:
         """Names are withdrawn where, with them in the model, means are still redder than calibrated, or powers still restless."""

@@ -10,9 +10,10 @@ from gyrostab.diagnose.effects.candidates import Candidate
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.search import Found, together
 
-__all__ = ["PLAIN_LINE", "axes_of", "by_key", "gain_of", "gain_sum", "parts_of", "tried_again", "without_lines"]
+__all__ = ["LEAST", "PLAIN_LINE", "axes_of", "by_key", "gain_of", "gain_sum", "parts_of", "tried_again", "without_lines"]
 
-_ROW = 2.0  # nats that an axis must bring to be named with the others
+#: What an axis must bring to be named with the others [nats].
+LEAST = 2.0
 #: The effect that says of a line no more than that it is there.
 PLAIN_LINE = "spectral_line"
 
@@ -20,7 +21,7 @@ PLAIN_LINE = "spectral_line"
 def parts_of(found: Found) -> list[Part]:
     """Rows of a candidate that bring something."""
     gain = found.gain[0]
-    rows = [number for number in range(gain.size) if gain[number] > _ROW]
+    rows = [number for number in range(gain.size) if gain[number] > LEAST]
     rows = rows or [int(gain.argmax())]
     return [
         Part(
@@ -40,7 +41,7 @@ def by_key(found: Sequence[Found]) -> dict[str, list[Part]]:
     for one in found:
         out.setdefault(one.candidate.key, []).extend(parts_of(one))
     for key, parts in out.items():
-        good = [part for part in parts if part.gain > _ROW]
+        good = [part for part in parts if part.gain > LEAST]
         out[key] = sorted(good or parts, key=lambda part: -part.gain)
     return out
 
@@ -66,8 +67,9 @@ def gain_sum(parts: Sequence[Part]) -> float:
 
 
 def gain_of(parts: Sequence[Part], like: Part) -> float:
-    """Gain of the part in the same view and row."""
-    return next((one.gain for one in parts if one.candidate.view == like.candidate.view and one.row == like.row), like.gain)
+    """Gain of the part in the same view and row, and beside the same witness."""
+    wanted = like.candidate.view, like.row, like.candidate.witness
+    return next((one.gain for one in parts if (one.candidate.view, one.row, one.candidate.witness) == wanted), like.gain)
 
 
 def tried_again(parts: Sequence[Part]) -> list[Candidate]:
