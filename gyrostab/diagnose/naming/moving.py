@@ -24,7 +24,7 @@ _BEYOND, _FAR = 6.0, 100.0  # times the scatter of the means at rest
 _GROWN = 2  # blocks to either side that belong to a motion
 _FEWEST, _MOST = 2, 2.0 / 3.0  # blocks that move, and share of them: what turns most of the time has no rest to be compared with
 _CORE, _CORE_WIDTH = 0.25, 0.637  # share of the blocks whose means lie closest together, and its width in standard deviations
-_LEAST_REST = 24  # blocks
+_LEAST_REST = 12  # blocks
 _ROUNDS = 3
 _FITTED = ("mean", "levels")  # views whose columns say how much of a mean that moves they account for
 _MEANS = ("wander", "marks", "order", "transfer")  # views of effects that account for it in other ways
@@ -80,7 +80,7 @@ def _moving(mean: Array) -> NDArray[np.bool_]:
     near = np.convolve(there[place], np.ones(2 * _GROWN + 1), "same") > 0.5  # neighbours among the blocks that are there
     out = nothing.copy()
     out[place] = near
-    return out if near.mean() <= _MOST and np.count_nonzero(~near) >= _LEAST_REST else nothing
+    return out if rest.sum() >= (1.0 - _MOST) * good.sum() and np.count_nonzero(~near) >= _LEAST_REST else nothing
 
 
 def _core(mean: Array) -> tuple[float, float]:
