@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["mixed_evidence"]
+__all__ = ["chosen_products", "mixed_evidence"]
 
 Array = NDArray[np.float64]
 #: What is this much less likely than the best, as a logarithm, adds nothing that counts: it is taken for so likely.
@@ -21,54 +21,65 @@ _NEGLIGIBLE = 40.0
 
 @njit(**KERNEL)
 def _terms(base: Array, rotated: Array, constant: Array, share: Array) -> tuple[Array, Array]:
-    """Logarithm of every term of the mixture less the largest of its record, (record, width x grid), and that largest one."""
-    records, grid, p = rotated.shape
-    kinds = constant.shape[0]
-    out = np.empty((records, kinds * grid))
-    best = np.empty(records)
+    """Logarithm of every term of the mixture less the largest of its design and record, (design, record, width x grid), and that one."""
+    designs, records, grid, p = rotated.shape
+    kinds = constant.shape[1]
+    out = np.empty((designs, records, kinds * grid))
+    best = np.empty((designs, records))
     square = np.empty((p, grid))
     peak = np.empty(grid)
-    for r in range(records):
-        for g in range(grid):
-            for j in range(p):
-                square[j, g] = rotated[r, g, j] * rotated[r, g, j]
-        peak[:] = -np.inf
-        for k in range(kinds):
-            row = out[r, k * grid : (k + 1) * grid]
+    for d in range(designs):
+        for r in range(records):
             for g in range(grid):
-                row[g] = base[r, g] + constant[k, g]
-            for j in range(p):
+                for j in range(p):
+                    square[j, g] = rotated[d, r, g, j] * rotated[d, r, g, j]
+            peak[:] = -np.inf
+            for k in range(kinds):
+                row = out[d, r, k * grid : (k + 1) * grid]
                 for g in range(grid):
-                    row[g] += share[k, j, g] * square[j, g]
-            for g in range(grid):
-                peak[g] = row[g] if row[g] > peak[g] else peak[g]
-        best[r] = peak.max()
-        for i in range(kinds * grid):
-            below = out[r, i] - best[r]
-            out[r, i] = below if below > -_NEGLIGIBLE else -_NEGLIGIBLE
+                    row[g] = base[r, g] + constant[d, k, g]
+                for j in range(p):
+                    for g in range(grid):
+                        row[g] += share[d, k, j, g] * square[j, g]
+                for g in range(grid):
+                    peak[g] = row[g] if row[g] > peak[g] else peak[g]
+            best[d, r] = peak.max()
+            for i in range(kinds * grid):
+                below = out[d, r, i] - best[d, r]
+                out[d, r, i] = below if below > -_NEGLIGIBLE else -_NEGLIGIBLE
     return out, best
 
 
 def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Array) -> Array:
-    """Log marginal likelihood of every record over grid points, and widths of the prior, of equal weight.
+    """Log marginal likelihood of every design and record over grid points, and widths of the prior, of equal weight.
 
     Parameters
     ----------
     base : ndarray, shape (record, grid)
         Log likelihood without the design, with the weight of the grid point.
-    rotated : ndarray, shape (record, grid, p)
+    rotated : ndarray, shape (design, record, grid, p)
         ``x' y`` in the frame of the eigenvectors of ``x' x``.
-    eigenvalues : ndarray, shape (grid, p)
+    eigenvalues : ndarray, shape (design, grid, p)
         Of ``x' x``.
     widths : ndarray, shape (width,)
         Variances of the factors.
 
     Returns
     -------
-    ndarray, shape (record,)
+    ndarray, shape (design, record)
     """
-    spread = 1.0 + widths[:, None, None] * eigenvalues.T  # (width, p, grid)
+    spread = 1.0 + widths[:, None, None] * eigenvalues.transpose(0, 2, 1)[:, None]  # (design, width, p, grid)
     share = 0.5 * widths[:, None, None] / spread
-    constant = -np.log(widths.size) - 0.5 * np.log(spread).sum(axis=1)
+    constant = -np.log(widths.size) - 0.5 * np.log(spread).sum(axis=2)
     terms, best = _terms(base, rotated, constant, share)
-    return np.asarray(best + np.log(np.exp(terms, out=terms).sum(axis=1)))  # numpy takes many exponentials at once
+    return np.asarray(best + np.log(np.exp(terms, out=terms).sum(axis=2)))  # numpy takes many exponentials at once
+
+
+@njit(**KERNEL)
+def chosen_products(columns: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
+    """Products of some pairs of columns, summed over the rows: ``out[q] = columns[:, first[q]] @ columns[:, second[q]]``."""
+    out = np.zeros(first.size)
+    for i in range(columns.shape[0]):
+        for q in range(first.size):
+            out[q] += columns[i, first[q]] * columns[i, second[q]]
+    return out

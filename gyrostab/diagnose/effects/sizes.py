@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,7 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     present = np.isfinite(y)
     size = np.abs(whole - whole.mean(axis=0)).max(axis=0)
     size = np.where(size > 0.0, size, 1.0)
-    grid = {"K": baseline["grid_K"].sel(axis=axis).values, "B": baseline["grid_B"].sel(axis=axis).values}
+    grid: dict[str, Any] = {"K": baseline["grid_K"].sel(axis=axis).values, "B": baseline["grid_B"].sel(axis=axis).values}
     products = mean_products(
         np.where(present, y, 0.0)[:, None],
         whole / size,

@@ -27,6 +27,7 @@ from gyrostab.diagnose.gains.products import (
     evidence,
     limits_of,
     mean_products,
+    pairs_of,
     power_products,
     score,
     share_out,
@@ -116,17 +117,19 @@ def mean_factors(
     values = _records((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
     columns, numbers = _columns(designs, (n,))
     beside = np.empty((n, 0)) if given is None else np.asarray(given, dtype=np.float64).reshape(n, -1)
+    own = columns.shape[1]
     columns = np.concatenate([columns, beside], axis=1)
     present = np.asarray(np.isfinite(values).all(axis=1))
     frame: dict[str, Any] = {
         "variance": np.asarray(baseline["mean_variance"].sel(axis=axis).values, dtype=np.float64),
         "step": float(data["end"][0] - data["begin"][0]),
+        "pairs": pairs_of(columns.shape[1], numbers, beside.shape[1]),
     }
     white = mean_products(values[:, :0], columns, **frame, K=np.zeros(1), B=np.zeros(1), present=present)
     before = (np.where(present[:, None], columns, 0.0) ** 2 / frame["variance"][:, None])[present].sum(axis=0)
-    wide = limits_of(before, np.diagonal(white.gram[0]))[columns.shape[1] - beside.shape[1] :]
+    wide = limits_of(before, np.diagonal(white.gram[0]))[own:]
     precision = np.diag(1.0 / np.square(np.where(wide > 0.0, wide, 1.0) * WIDTHS[-1]))
-    limits = limits_of(before[: columns.shape[1] - beside.shape[1]], np.diagonal(take_out(white, beside.shape[1], precision).gram[0]))
+    limits = limits_of(before[:own], np.diagonal(take_out(white, beside.shape[1], precision).gram[0]))
     grid: dict[str, Any] = {"K": baseline["grid_K"].sel(axis=axis).values, "B": baseline["grid_B"].sel(axis=axis).values}
     log_weight = _log_weight(baseline, axis, tier)
     subsets = fold_subsets(fold_blocks(data) if folds is None else folds)

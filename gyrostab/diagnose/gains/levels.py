@@ -244,12 +244,12 @@ def _worth(found: Courses, values: Array, given: Array, frame: dict[str, Any], g
     for r in range(records):
         base = (weight - 0.5 * (products.square[:, r] + products.log_determinant))[None]
         unit = 1.0 / np.sqrt(max(usual[r] + scatter[r], 1e-300))
-        rotated = (products.cross[:, r, r] * unit)[None, :, None]
-        eigenvalues = ((products.gram[:, r, r] + scatter[r]) * unit**2)[:, None]
+        rotated = (products.cross[:, r, r] * unit)[None, None, :, None]
+        eigenvalues = ((products.gram[:, r, r] + scatter[r]) * unit**2)[None, :, None]
         out[r] = _evidence(base, rotated, eigenvalues) - np.logaddexp.reduce(base[0])
     return out - found.cost
 
 
 def _evidence(base: Array, rotated: Array, eigenvalues: Array) -> float:
     """Of the step, whose prior has the widths of all factors."""
-    return float(mixed_evidence(base, np.ascontiguousarray(rotated), np.maximum(eigenvalues, 0.0), np.square(WIDTHS))[0])
+    return float(mixed_evidence(base, np.ascontiguousarray(rotated), np.maximum(eigenvalues, 0.0), np.square(WIDTHS))[0, 0])

@@ -9,17 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.gains.folds import FOLDS
-from gyrostab.kernels.evidence import mixed_evidence
+from gyrostab.kernels.evidence import chosen_products, mixed_evidence
 from gyrostab.kernels.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
 
-__all__ = ["WIDTHS", "Array", "Products", "evidence", "limits_of", "mean_products", "power_products", "score", "share_out", "take_out"]
+__all__ = [
+    "WIDTHS",
+    "Array",
+    "Products",
+    "evidence",
+    "limits_of",
+    "mean_products",
+    "pairs_of",
+    "power_products",
+    "score",
+    "share_out",
+    "take_out",
+]
 
 Array = NDArray[np.float64]
 #: Standard deviations of the prior of a factor, in errors that it would have in white noise.
 WIDTHS = (1.0, 10.0, 100.0, 1000.0)
 #: A design that keeps less than this share of its square beside constants and given columns is not there.
 _NOTHING = 1e-9
+_AT_ONCE = 10_000  # designs times records times grid points whose evidence is worked out at once
 
 
 @dataclass(frozen=True)
@@ -79,6 +92,7 @@ def mean_products(
     K: Array,
     B: Array,
     present: NDArray[np.bool_],
+    pairs: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
 ) -> Products:
     """Products of block means and columns, whitened for every pair of K and B.
 
@@ -96,6 +110,8 @@ def mean_products(
         Random walk [deg/h^1.5] and flicker [deg/h].
     present : ndarray of bool, shape (block,)
         Blocks that are used.
+    pairs : two ndarrays, optional
+        Columns whose products with each other are asked for, from `pairs_of`; all by default. The other products stay 0.
     """
     n, width = columns.shape
     both = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
@@ -105,13 +121,27 @@ def mean_products(
     steps = np.full(n, step)
     shape = (K.size, values.shape[1])
     square, cross = np.empty(shape), np.empty((K.size, width, shape[1]))
-    gram, determinant = np.empty((K.size, width, width)), np.empty(K.size)
+    gram, determinant = np.zeros((K.size, width, width)), np.empty(K.size)
     for g, (k, b) in enumerate(zip(K**2 / HOUR, B**2, strict=True)):
         states = (share * b, time) if b > 0.0 else (share[:0], time[:0])
         done, determinant[g] = whiten(both, spread + b * white, steps, present, float(k), *states)
         x, y = done[:, :width], done[:, width:]
-        gram[g], cross[g], square[g] = x.T @ x, x.T @ y, np.einsum("ij,ij->j", y, y)
+        cross[g], square[g] = x.T @ y, np.einsum("ij,ij->j", y, y)
+        if pairs is None:
+            gram[g] = x.T @ x
+        else:
+            gram[g][pairs] = gram[g][pairs[::-1]] = chosen_products(done, *pairs)
     return Products(square, cross, gram, determinant)
+
+
+def pairs_of(width: int, designs: Sequence[NDArray[np.int64]], given: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of columns that meet in a model: each and itself, those of a design, and the last `given` and any other."""
+    wanted = np.eye(width, dtype=np.bool_)
+    wanted[:, width - given :] = True
+    for chosen in designs:
+        wanted[np.ix_(chosen, chosen)] = True
+    first, second = np.nonzero(np.triu(wanted))
+    return first, second
 
 
 def power_products(residual: Array, weight: Array, columns: Array) -> Products:
@@ -185,18 +215,27 @@ def evidence(products: Products, designs: Sequence[NDArray[np.int64]], limits: A
     base = np.ascontiguousarray((weight[:, None] - 0.5 * (products.square + products.log_determinant[:, None])).T)
     out = np.empty((1 + len(designs), base.shape[0]))
     out[0] = np.logaddexp.reduce(base, axis=1)
-    widths = np.square(WIDTHS)
-    for number, chosen in enumerate(designs, start=1):
-        scale = limits[chosen]
-        gram = products.gram[:, chosen[:, None], chosen] * np.outer(scale, scale)
-        cross = products.cross[:, chosen] * scale[:, None]
-        if chosen.size == 1:
-            eigenvalues, rotated = gram[:, :, 0], cross
-        else:
-            eigenvalues, vectors = np.linalg.eigh(gram)
-            rotated = vectors.transpose(0, 2, 1) @ cross
-        out[number] = mixed_evidence(base, np.ascontiguousarray(rotated.transpose(2, 0, 1)), np.maximum(eigenvalues, 0.0), widths)
+    at_once = max(1, _AT_ONCE // max(base.size, 1))
+    for width in sorted({chosen.size for chosen in designs}):
+        alike = [number for number, chosen in enumerate(designs) if chosen.size == width]
+        for first in range(0, len(alike), at_once):
+            several = alike[first : first + at_once]
+            out[1 + np.array(several)] = _alike_evidence(products, np.stack([designs[number] for number in several]), limits, base)
     return out
+
+
+def _alike_evidence(products: Products, chosen: NDArray[np.int64], limits: Array, base: Array) -> Array:
+    """Log marginal likelihood (design, record) of designs of so many columns each, `chosen` (design, column)."""
+    scale = limits[chosen]
+    gram = products.gram[:, chosen[:, :, None], chosen[:, None, :]] * (scale[:, :, None] * scale[:, None, :])
+    rotated = products.cross[:, chosen] * scale[..., None]
+    if chosen.shape[1] == 1:
+        eigenvalues = gram[..., 0]
+    else:
+        eigenvalues, vectors = np.linalg.eigh(gram)
+        rotated = vectors.swapaxes(2, 3) @ rotated
+    squares = np.ascontiguousarray(np.maximum(eigenvalues, 0.0).swapaxes(0, 1))
+    return mixed_evidence(base, np.ascontiguousarray(rotated.transpose(1, 3, 0, 2)), squares, np.square(WIDTHS))
 
 
 def score(factors: Array, owner: Sequence[int] | NDArray[np.int64], *, weight: Sequence[float] | None = None, folds: int = FOLDS) -> Array:

@@ -1,0 +1,27 @@
+"""Products of whitened columns: those that no design asks for are left out, and change nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gyrostab.diagnose.gains.products import evidence, mean_products, pairs_of, take_out
+
+
+def test_products_of_columns_that_never_meet_are_not_needed():
+    rng = np.random.default_rng(8)
+    values, columns = rng.standard_normal((60, 3)), rng.standard_normal((60, 7))
+    frame_of = {
+        "variance": np.ones(60),
+        "step": 20.0,
+        "K": np.array([0.0, 3.0]),
+        "B": np.array([0.0, 0.5]),
+        "present": rng.random(60) > 0.1,
+    }
+    numbers = [np.array(chosen) for chosen in ([0], [1, 2], [3], [4, 5])]
+    whole = mean_products(values, columns, **frame_of)
+    some = mean_products(values, columns, **frame_of, pairs=pairs_of(7, numbers, 1))
+    assert some.gram[0, 0, 1] == 0.0 != whole.gram[0, 0, 1]
+    wanted, got = (evidence(take_out(one, 1, np.eye(1)), numbers, np.full(6, 0.2), np.array([-1.0, -2.0])) for one in (whole, some))
+    np.testing.assert_allclose(got, wanted, rtol=1e-12)
+    alone = evidence(take_out(whole, 1, np.eye(1)), numbers[3:], np.full(6, 0.2), np.array([-1.0, -2.0]))
+    np.testing.assert_allclose(alone[1], got[4], rtol=1e-12)
