@@ -102,10 +102,23 @@ def effective(density: Array, reduced: xr.Dataset, row: str = "axis") -> Array:
 
     The row may be a pair of axes in place of an axis.
     """
-    near = in_place(reduced, row)[..., None]
-    width = reduced["band_high"].values - reduced["band_low"].values
+    return _mixed(density, in_place(reduced, row), band_widths(reduced))
+
+
+def band_widths(reduced: xr.Dataset) -> Array:
+    """Widths of the bands [Hz]."""
+    return np.asarray(reduced["band_high"].values - reduced["band_low"].values)
+
+
+def _mixed(density: Array, near: Array, width: Array) -> Array:
+    """A density (..., band) with that share of it in its place, `near` (...), and the rest spread over all bands."""
     level = (density * width).sum(axis=-1, keepdims=True) / width.sum()
-    return np.asarray(near * density + (1.0 - near) * level)
+    return np.asarray(near[..., None] * density + (1.0 - near[..., None]) * level)
+
+
+def _row_of(density: Array, row: int) -> Array:
+    """One row of a density that has all of them, or one for all."""
+    return np.asarray(density[row if density.shape[0] > 1 else 0])
 
 
 def pair_rows(reduced: xr.Dataset) -> list[tuple[str, ...]]:
@@ -162,7 +175,8 @@ def _spread(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
 
 def power_column(density: Array, row: int, state: State) -> Array:
     """An added density (axis or 1, block or 1, band) on one axis as gaps let it be seen, (block, band)."""
-    return np.asarray(np.broadcast_to(effective(density, state.reduced), state.weight.shape)[row])
+    seen = _mixed(_row_of(density, row), in_place(state.reduced)[row], band_widths(state.reduced))
+    return np.broadcast_to(seen, state.weight.shape[1:])
 
 
 def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
@@ -174,8 +188,11 @@ def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
     level, precision = noise_columns(state.baseline, axis=axis)
     known = [level[..., number] * expected for number in range(level.shape[2])]
     given, whole = _beside(state, "power", (axis,), weight.shape, known, np.diagonal(precision))
+    near, width = in_place(state.reduced)[row], band_widths(state.reduced)
     designs = [
-        _spread([power_column(one, row, state) for one in variant.design], weight.shape) for each in candidates for variant in each.variants
+        _spread([_mixed(_row_of(one, row), near, width) for one in variant.design], weight.shape)
+        for each in candidates
+        for variant in each.variants
     ]
     return independent(Cells(values, weight, designs, given, whole), state.baseline["common"].sel(axis=axis).values, state.weight[row])
 
@@ -205,8 +222,9 @@ def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
     weight = np.concatenate([2.0 * shape / (alone + apart), 2.0 * shape / np.maximum(alone - apart, _LEAST_SHARE * alone)], axis=1)
     weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
     given, precision = _beside(state, "cross", pair, weight.shape)
+    near, width = in_place(state.reduced, "pair")[row], band_widths(state.reduced)
     designs = [
-        _spread([_parts(cross_column(one, row, state.reduced)) for one in variant.design], weight.shape)
+        _spread([_parts(_mixed(_row_of(one, row) + 0j, near, width)) for one in variant.design], weight.shape)
         for each in candidates
         for variant in each.variants
     ]
