@@ -143,9 +143,9 @@ def _powers(values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coeff
 
 def _filtered(response: Array, coefficient: xr.DataArray, frequency: Array, rate: float) -> Array:
     total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
-    for symbol in "QNBK":
-        if symbol in coefficient["term"].values:
-            total += coefficient.sel(term=symbol).values[:, None, None] ** 2 * term_density(symbol, frequency, rate)
+    size, terms = coefficient.transpose("axis", "term").values, list(coefficient["term"].values)
+    for symbol in (one for one in "QNBK" if one in terms):
+        total += size[:, terms.index(symbol), None, None] ** 2 * term_density(symbol, frequency, rate)
     return total * (response - 1.0)
 
 

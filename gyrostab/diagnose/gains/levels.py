@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.gains.products import WIDTHS, mean_products, take_out
+from gyrostab.diagnose.gains.products import WIDTHS, mean_products, pairs_of, take_out
 from gyrostab.kernels.evidence import mixed_evidence
 from gyrostab.kernels.levels import level_tables, levels_smooth
 
@@ -237,7 +237,8 @@ def _worth(found: Courses, values: Array, given: Array, frame: dict[str, Any], g
     white = mean_products(values[:, :0], columns, **frame, K=np.zeros(1), B=np.zeros(1))
     square = np.diagonal(white.gram[0])
     wide = np.where(square[records:] > 0.0, square[records:], 1.0) / WIDTHS[-1] ** 2
-    products = take_out(mean_products(values, columns, **frame, **grid), beside, np.diag(wide))
+    pairs = pairs_of(columns.shape[1], [], beside)
+    products = take_out(mean_products(values, columns, **frame, **grid, pairs=pairs), beside, np.diag(wide))
     usual = np.diagonal(take_out(white, beside, np.diag(wide)).gram[0])
     weight = log_weight - np.logaddexp.reduce(log_weight)
     out = np.empty(records)
