@@ -212,24 +212,26 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     variables: dict[Any, xr.Variable] = {}
     grids = declared_grids(stored)
     axes, close = _axes(stored, grids, where), stored._close
-    stored = stored.rename_dims({index_dim(rule["dim"]): rule["dim"] for rule in grids.values() if index_dim(rule["dim"]) in stored.dims})
+    dims: dict[Any, Any] = {index_dim(rule["dim"]): rule["dim"] for rule in grids.values()}
     for name, variable in stored.variables.items():
         if name in grids:
             continue
         parent = stored.variables[bounds[name]] if name in bounds else variable
-        opened = decode_stamps(variable, parent.attrs)
+        opened = decode_stamps(variable.copy(deep=False), parent.attrs)
         if opened.dtype.kind in "OT":
             opened = opened.astype(str)
         if name in stored.coords or name in bounds:
             opened = opened.load()
         opened.attrs = _attributes_from_disk(dict(opened.attrs))
+        opened.dims = tuple(dims.get(dim, dim) for dim in opened.dims)
         variables[name] = opened.transpose(*_memory_order(opened.dims))
-    names = [name for name in variables if name in stored.coords or name in bounds]
-    dataset = xr.Dataset(variables).set_coords(names)
+    beside = xr.Coordinates({name: variables.pop(name) for name in list(variables) if name in stored.coords or name in bounds})
+    coords, indexes = dict(beside.variables), dict(beside.xindexes)
     for name, axis in axes.items():
-        dataset = dataset.assign_coords(axis)
-        dataset[grids[name]["dim"]].attrs = json.loads(stored.variables[name].attrs.get("axis_attributes", "{}"))
-    dataset.attrs = _attributes_from_disk(dict(stored.attrs))
+        coords |= axis.variables
+        indexes |= axis.xindexes
+        coords[grids[name]["dim"]].attrs = json.loads(stored.variables[name].attrs.get("axis_attributes", "{}"))
+    dataset = xr.Dataset(variables, xr.Coordinates(coords, indexes=indexes), _attributes_from_disk(dict(stored.attrs)))
     dataset.set_close(close)
     return dataset
 

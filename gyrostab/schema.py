@@ -134,15 +134,14 @@ def texts(dataset: xr.Dataset, name: str) -> list[str]:
 
 def log_channels(log: xr.Dataset) -> list[str]:
     """Names of the channels of a log: one-dimensional variables on ``time`` or on their own ``time_<channel>``."""
-    return [str(name) for name, variable in log.data_vars.items() if variable.dims in (("time",), (f"time_{name}",))]
+    return [str(name) for name in log.data_vars if log.variables[name].dims in (("time",), (f"time_{name}",))]
 
 
 def _require(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -> None:
     for name, expected in dims.items():
         if name not in dataset.variables:
             raise SchemaError(f"this is not a {what}: it has no variable {name!r}; it has {sorted(map(str, dataset.variables))}")
-        if dataset[name].dims != expected:
-            has = dataset[name].dims
+        if (has := dataset.variables[name].dims) != expected:
             raise SchemaError(f"{what}: variable {name!r} has dimensions {has}, expected {expected}; transpose or rename them")
 
 
@@ -168,7 +167,7 @@ def check_log(log: xr.Dataset) -> None:
 
 
 def _check_units(dataset: xr.Dataset, name: str) -> None:
-    units = dataset[name].attrs.get("units")
+    units = dataset.variables[name].attrs.get("units")
     if units != SIGNAL_UNITS[name]:
         raise SchemaError(f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; convert it and say so")
 

@@ -4,6 +4,7 @@ import json
 import warnings
 
 import dask.array as da
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -19,7 +20,7 @@ from gyrostab.read.buffers import Spool, lazily
 from gyrostab.regularise import fill
 from gyrostab.regularise.place import Placement
 from gyrostab.run import checkpoint, load_log, run
-from gyrostab.store import read, write
+from gyrostab.store import header, read, write
 from gyrostab.store.direct import can_fill, end_to_end, fill_row, held, one_row, stack_rows, stretch
 from gyrostab.store.header import read_header
 
@@ -126,15 +127,32 @@ def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, fo
     np.testing.assert_array_equal(found[0].rate.values, log.rate.values)
 
 
-def test_a_zarr_log_is_opened_as_xarray_opens_it(tmp_path, monkeypatch):
-    path = stored_logs(tmp_path, "zarr")[0]
+@pytest.mark.parametrize("form", ["nc", "zarr"])
+def test_a_log_is_opened_as_xarray_opens_it(tmp_path, monkeypatch, form):
+    path = stored_logs(tmp_path, form)[0]
     assert read_header(path) is not None
     quick = open_log(path)
     monkeypatch.setattr(read, "read_header", lambda path: None)
     slow = open_log(path)
     xr.testing.assert_identical(quick.compute(), slow.compute())
     assert list(quick.variables) == list(slow.variables)
+    assert list(quick.coords) == list(slow.coords)
     assert quick.rate.encoding == slow.rate.encoding
+    assert {name: one.dtype for name, one in quick.variables.items()} == {name: one.dtype for name, one in slow.variables.items()}
+
+
+@pytest.mark.parametrize("how", ["group", "product", "size"])
+def test_a_netcdf_file_that_is_not_as_expected_is_left_to_xarray(tmp_path, monkeypatch, how):
+    path = stored_logs(tmp_path, "nc")[0]
+    if how == "size":
+        monkeypatch.setattr(header, "SMALL", 2)  # the small variables are too long to be read at once
+    else:
+        with netCDF4.Dataset(path, "a") as file:
+            if how == "group":
+                file.createGroup("more")
+            else:
+                file.setncattr("gyrostab_content", "product")
+    assert read_header(path) is None
 
 
 @pytest.mark.parametrize("how", ["cut", "other order", "no attributes"])

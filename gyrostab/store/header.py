@@ -1,8 +1,7 @@
-"""What stands in a Zarr log beside its long variables, read in one look: attributes, dimensions, small variables.
+"""What stands in a log beside its long variables, read in one look: attributes, dimensions, small variables.
 
-xarray and the library below it take three times as long, which is felt where an archive has hundreds of logs. Only what gyrostab writes
-is understood here; for all else, damage included, the answer is nothing, and xarray has its say. (A NetCDF file gains nothing by
-this: looking up its attributes is what takes the time, by whatever library.)
+xarray and what it has around the library below it take two to three times as long, which is felt where an archive has hundreds of
+logs. Only what gyrostab writes is understood here; for all else, damage included, the answer is nothing, and xarray has its say.
 """
 
 from __future__ import annotations
@@ -16,8 +15,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.store.layout import decoded_chunk, zarr_codecs
+from gyrostab.store.lock import library_lock
 
-__all__ = ["Header", "read_header"]
+__all__ = ["SMALL", "Header", "read_header"]
+
+#: Values from which a variable of a log is a dask array.
+SMALL = 2**17
 
 
 class Header(NamedTuple):
@@ -41,7 +44,7 @@ class Header(NamedTuple):
 def read_header(path: Path) -> Header | None:
     """Look at a log that gyrostab wrote; None when it is something else, or in any way not as expected."""
     try:
-        header = _look(path) if path.is_dir() else None
+        header = _look_zarr(path) if path.is_dir() else _look_netcdf(path)
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError):
         return None
     if header is None or header.attrs.get("gyrostab_content") != "log" or "gyrostab_version" not in header.attrs:
@@ -60,7 +63,7 @@ def _nothing(dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
-def _look(folder: Path) -> Header:
+def _look_zarr(folder: Path) -> Header:
     described = json.loads((folder / ".zmetadata").read_bytes())["metadata"]
     variables: dict[str, xr.Variable] = {}
     long: set[str] = set()
@@ -83,6 +86,35 @@ def _look(folder: Path) -> Header:
             values = _values(folder / name, layout, shape, chunks, dtype)
         variables[name] = xr.Variable(dims, values, attrs, encoding)
     return Header(variables, dict(described.get(".zattrs", {})), long)
+
+
+def _look_netcdf(path: Path) -> Header:
+    import netCDF4
+
+    variables: dict[str, xr.Variable] = {}
+    long: set[str] = set()
+    with library_lock(), netCDF4.Dataset(path) as file:
+        if file.groups or file.getncattr("gyrostab_content") != "log":
+            raise ValueError("content")
+        file.set_auto_maskandscale(False)
+        file.set_auto_chartostring(False)
+        for name, stored in file.variables.items():
+            dims, shape, dtype, cut = stored.dimensions, stored.shape, stored.dtype, stored.chunking()
+            if not isinstance(dtype, np.dtype):
+                raise ValueError("type")
+            attrs = {key: stored.getncattr(key) for key in stored.ncattrs()}
+            chunks = None if isinstance(cut, str) else tuple(cut)
+            encoding: dict[str, Any] = {"dtype": dtype}
+            if _is_long(dims, attrs, dtype, chunks, shape):
+                long.add(name)
+                values = _nothing(dtype, shape)
+                encoding.update(stored.filters(), chunksizes=chunks)
+            elif stored.size < SMALL or dims == (name,):
+                values = np.asarray(stored[...])
+            else:
+                raise ValueError("size")
+            variables[name] = xr.Variable(dims, values, attrs, encoding)
+        return Header(variables, {key: file.getncattr(key) for key in file.ncattrs()}, long)
 
 
 def _values(folder: Path, layout: dict[str, Any], shape: tuple[int, ...], chunks: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:

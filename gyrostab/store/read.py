@@ -19,14 +19,12 @@ from gyrostab.cf import declared_grids, decode_stamps, index_dim
 from gyrostab.errors import FormatError
 from gyrostab.kernels.counts import from_counts
 from gyrostab.store.direct import with_fill
-from gyrostab.store.header import Header, read_header
+from gyrostab.store.header import SMALL, Header, read_header
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.timegrid import grid_times
 
 __all__ = ["open_stored"]
 
-#: Values from which a variable of a log is a dask array.
-_SMALL = 2**17
 #: Samples of the largest chunk that is kept when only a part of it was wanted.
 _KEPT_SAMPLES = 2**20
 
@@ -53,7 +51,7 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
         stored = _decoded(header)
         long = _long_variables(stored, path, strict=strict)
         if header.long <= long.keys():
-            return _lazy(stored, long, small=_SMALL)
+            return _lazy(stored, long, small=SMALL)
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
@@ -65,7 +63,7 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
         raise FormatError(f"{path}: is {name}, but not one that gyrostab wrote; read it with gyrostab.read_log (gyrostab ingest)")
     is_log = stored.attrs.get("gyrostab_content") == "log"
     long = _long_variables(stored, path, strict=strict) if is_log else {}
-    opened = _lazy(stored, long, small=_SMALL if is_log else 0)
+    opened = _lazy(stored, long, small=SMALL if is_log else 0)
     if is_log:
         stored.close()  # opened again where needed: no archive of any length holds more than a few files open
     return opened
@@ -81,11 +79,12 @@ def _decoded(header: Header) -> xr.Dataset:
 
 def _lazy(stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int) -> xr.Dataset:
     """Load what is small, and make dask arrays, by the chunks on disk, of what is not one yet: making and reading one takes its time."""
-    rest = {name: item.variable for name, item in stored.data_vars.items() if name not in long}
+    rest = {name: stored.variables[name] for name in stored.data_vars if name not in long}
     ready = {
         name: item.load() if item.size < small else item.chunk(item.encoding.get("preferred_chunks", {})) for name, item in rest.items()
     }
-    lazy = xr.Dataset({name: long.get(name, ready.get(name)) for name in stored.data_vars}, stored.coords, stored.attrs)
+    coords = xr.Coordinates({name: stored.variables[name] for name in stored.coords}, indexes={})
+    lazy = xr.Dataset({name: long.get(name, ready.get(name)) for name in stored.data_vars}, coords, stored.attrs)
     lazy.encoding = stored.encoding
     lazy.set_close(stored._close)
     return lazy
@@ -95,10 +94,11 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
     """The long variables of a log, as arrays that know about damage."""
     import dask.array as da
 
-    labels = [str(label) for label in stored["axis"].values]
+    labels = [str(label) for label in stored.variables["axis"].values]
     opened = uuid.uuid4().hex
     long: dict[Any, xr.Variable] = {}
-    for name, variable in stored.data_vars.items():
+    for name in stored.data_vars:
+        variable = stored.variables[name]
         dim = str(variable.dims[-1]) if variable.dims else ""
         disk = variable.encoding
         chunks = disk.get("chunks" if path.is_dir() else "chunksizes")
