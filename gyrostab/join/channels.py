@@ -41,7 +41,7 @@ def join_channels(pieces: Sequence[Piece], start: int, rate: float, size: int, c
     for name in dict.fromkeys(name for piece in pieces for name in log_channels(piece.source.log)):
         holders = [piece for piece in pieces if name in piece.source.log]
         attributes = _attributes(holders, name)
-        if all(piece.source.log[name].dims != ("time",) for piece in holders):
+        if all(piece.source.log.variables[name].dims != ("time",) for piece in holders):
             stamps, values = _own_time(holders, name, start, rate)
             variables[name] = (f"time_{name}", values, attributes)
             coordinates[f"time_{name}"] = stamps.view("datetime64[ns]")
@@ -51,7 +51,7 @@ def join_channels(pieces: Sequence[Piece], start: int, rate: float, size: int, c
 
 
 def _attributes(holders: Sequence[Piece], name: str) -> dict[str, Any]:
-    units = {str(piece.source.log[name].attrs.get("units", "1")): piece.source.name for piece in reversed(holders)}
+    units = {str(piece.source.log.variables[name].attrs.get("units", "1")): piece.source.name for piece in reversed(holders)}
     if len(units) > 1:
         listed = ", ".join(f"{unit!r} in {file}" for unit, file in units.items())
         raise UnitError(
@@ -84,7 +84,7 @@ def _spread(values: NDArray[Any], at: NDArray[np.int64], inside: NDArray[np.bool
 
 def _stamps(piece: Piece, name: str, start: int, rate: float) -> NDArray[np.int64]:
     """Stamps of a channel [ns since 1970], moved with its log where that stands after a step of the clock."""
-    stamps = piece.source.log[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
+    stamps = piece.source.log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
     moved = int(grid_times(start, rate, piece.first)) - piece.source.start
     return np.asarray(stamps + moved if abs(moved) > 1e9 / rate else stamps)
 
@@ -95,7 +95,7 @@ def _own_time(holders: Sequence[Piece], name: str, start: int, rate: float) -> t
     done: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []  # stamps and places among all values, in the order of time
     arrays, offset = [], 0
     for piece in holders:
-        values = piece.source.log[name].data
+        values = piece.source.log.variables[name].data
         stamps, places = _stamps(piece, name, start, rate), np.arange(len(values)) + offset
         arrays.append(values)
         offset += len(values)

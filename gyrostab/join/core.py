@@ -80,7 +80,7 @@ def join_logs(
     size = max(piece.end for piece in pieces)
     name = signal_name(sources[0].log)
     chunk = chunk_of([source.log[name].data for source in sources])
-    axes = sorted({str(axis) for source in sources for axis in source.log["axis"].values})
+    axes = sorted({axis for source in sources for axis in source.axes})
     signal = xr.Variable(
         ("axis", "time"), lay([_parts(pieces, name, axis) for axis in axes], size, chunk), _signal_attributes(sources, name)
     )
@@ -116,9 +116,9 @@ def _check_same(sources: Sequence[Source]) -> None:
 def _parts(pieces: Sequence[Piece], name: str, axis: str) -> list[Any]:
     found = []
     for piece in pieces:
-        rows = [str(label) for label in piece.source.log["axis"].values]
+        rows = piece.source.axes
         if axis in rows:
-            found.append((piece.source.log[name].data, rows.index(axis), piece.runs))
+            found.append((piece.source.log.variables[name].data, rows.index(axis), piece.runs))
     return found
 
 
@@ -128,7 +128,7 @@ def _signal_attributes(sources: Sequence[Source], name: str) -> dict[str, Any]:
 
 def _absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
     """Sentences on axes and channels that some of the logs lack."""
-    names = {f"axis {axis}": [s.name for s in sources if axis not in s.log["axis"].values] for axis in axes}
+    names = {f"axis {axis}": [s.name for s in sources if axis not in s.axes] for axis in axes}
     for channel in dict.fromkeys(name for source in sources for name in log_channels(source.log)):
         names[f"channel {channel}"] = [source.name for source in sources if channel not in source.log]
     return [f"{what} is not in {some(files)} and is missing there" for what, files in names.items() if files]

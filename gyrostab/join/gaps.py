@@ -23,13 +23,13 @@ _FAR = np.iinfo(np.int64).max // 2
 
 def _own_gaps(piece: Piece) -> Table:
     """The table of one log, on the common grid."""
-    log, source = piece.source.log, piece.source
+    log, source = piece.source.log.variables, piece.source
     table = _NONE
-    if "gap_start" in log.variables and log.sizes["gap"]:
+    if "gap_start" in log and log["gap_start"].size:
         ends = (log[name].values.astype("datetime64[ns]").view(np.int64) for name in ("gap_start", "gap_end"))
         first, end = (piece.on_grid(np.rint(grid_index(source.start, source.rate, stamps)).astype(np.int64)) for stamps in ends)
         samples = log["gap_samples"].values.astype(np.int64)
-        rows = log["gap_rows"].values.astype(np.int64) if "gap_rows" in log.variables else np.zeros_like(samples)
+        rows = log["gap_rows"].values.astype(np.int64) if "gap_rows" in log else np.zeros_like(samples)
         table = np.stack([first, end, samples, rows, log["gap_cause"].values.astype(np.int64)], axis=1)
     return np.concatenate([table, _slips(piece)]) if len(piece.runs) > 1 else table
 

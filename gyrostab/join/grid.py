@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.schema import signal_name
+from gyrostab.store.direct import stretch
 from gyrostab.timegrid import TimeGridIndex, first_stamp, grid_times
 
 __all__ = ["Piece", "Source", "Stretch", "log_span", "read_stretches", "runs_of", "source_of"]
@@ -31,6 +33,11 @@ class Source:
     def end(self) -> int:
         """Stamp of the last sample [ns since 1970]."""
         return int(grid_times(self.start, self.rate, self.size - 1))
+
+    @cached_property
+    def axes(self) -> list[str]:
+        """Names of the axes, in the order of the rows; looked up once, as xarray and pandas take their time over it."""
+        return [str(axis) for axis in self.log["axis"].values]
 
 
 #: A log, and the samples at which a stretch of it begins and ends.
@@ -79,20 +86,24 @@ class Piece:
 
 
 def read_stretches(wanted: Iterable[Stretch]) -> dict[Stretch, NDArray[np.float64]]:
-    """The signals of stretches (axis, sample), read together; NaN beyond the ends of a log."""
-    import dask
+    """The signals of stretches (axis, sample), read side by side; NaN beyond the ends of a log."""
+    from dask.system import CPU_COUNT
 
     places = list(dict.fromkeys(wanted))
-    lazy = [
-        source.log[signal_name(source.log)].data[:, min(max(begin, 0), source.size) : max(min(end, source.size), 0)]
-        for source, begin, end in places
-    ]
-    found: dict[Stretch, NDArray[np.float64]] = {}
-    for (source, begin, end), values in zip(places, dask.compute(*lazy, scheduler="threads"), strict=True):
-        low = min(max(begin, 0), source.size)
-        found[source, begin, end] = whole = np.full((values.shape[0], end - begin), np.nan)
-        whole[:, low - begin : low - begin + values.shape[1]] = values
-    return found
+    if not places:
+        return {}
+    with ThreadPoolExecutor(CPU_COUNT) as pool:
+        return dict(zip(places, pool.map(_read_stretch, places), strict=True))
+
+
+def _read_stretch(place: Stretch) -> NDArray[np.float64]:
+    source, begin, end = place
+    data = source.log.variables[signal_name(source.log)].data
+    whole = np.full((data.shape[0], end - begin), np.nan)
+    low, high = min(max(begin, 0), source.size), max(min(end, source.size), 0)
+    if high > low:
+        whole[:, low - begin : high - begin] = stretch(data, low, high)
+    return whole
 
 
 def source_of(log: xr.Dataset, name: str) -> Source:

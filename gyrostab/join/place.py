@@ -97,11 +97,11 @@ def _neighbours(sources: Sequence[Source]) -> _Cache:
 
 def _match(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
     """Compare two logs where the clock says that both have samples: sample 0 of `new` at sample `lag` of `held`."""
-    axes = [str(axis) for axis in held.log["axis"].values if axis in new.log["axis"].values]
+    axes = [axis for axis in held.axes if axis in new.axes]
     pairs = _stretches(held, new, lag)
     if not axes or not pairs:
         return _Match(0, 0, 0)
-    rows_held, rows_new = ([list(source.log["axis"].values).index(axis) for axis in axes] for source in (held, new))
+    rows_held, rows_new = ([source.axes.index(axis) for axis in axes] for source in (held, new))
     found: list[_Match] = []
     for there, here in pairs:
         if found and found[0].common >= _COMPARED // 2 and found[0].same < 0.5 * found[0].common:
