@@ -256,3 +256,12 @@ def test_the_head_of_a_big_file_may_end_inside_a_line() -> None:
     layout = find_layout(Path("x.csv"), b"time [s],gyro_x [deg/h]\n0,1\n1,2\n2,", complete=False)
     assert layout.samples == (("0", "1"), ("1", "2"))
     assert (layout.offset, layout.line) == (24, 2)
+
+
+def test_the_layout_is_that_of_the_first_lines_and_a_strange_byte_far_below_is_told() -> None:
+    head = b"\xef\xbb\xbf# a tool\ntime [s],gyro_x [deg/h]\n" + b"".join(b"%d,1.5\n\n" % n for n in range(3000))
+    short = find_layout(Path("x.csv"), head[: head.index(b"\n400,")], complete=False)
+    assert (short.headers, short.line) == (("time [s]", "gyro_x [deg/h]"), 3)
+    assert find_layout(Path("x.csv"), head, complete=True) == short
+    strange = find_layout(Path("x.csv"), head[3:].replace(b"\n2500,1.5", b"\n2500,\xb0"), complete=True)
+    assert strange.notes == ("line 5003 is not UTF-8 (b'\\xb0'); the text was read as Latin-1",)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from gyrostab.errors import FormatError
@@ -15,6 +16,8 @@ __all__ = ["BLANK", "Layout", "find_layout", "is_number", "is_text", "split_line
 #: Stands for any run of blanks as the separator.
 BLANK = " "
 HEAD_LINES = 200
+#: Lines that are looked at: those among which the header may be, those that follow one, and the first rows of data.
+MOST_LINES = 2 * HEAD_LINES + 20
 
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
 _HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\]]*\])?(?:[ \t]+\[[^\]]*\])?)")
@@ -81,7 +84,8 @@ def find_layout(path: Path, head: bytes, *, complete: bool) -> Layout:
         When the file is empty, is not text, or has no data rows.
     """
     lines, notes = _decode(path, head, complete=complete)
-    content = [index for index, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
+    filled = (index for index, line in enumerate(lines) if line.strip() and not _COMMENT.match(line))
+    content = list(islice(filled, MOST_LINES))
     if not content:
         raise FormatError(f"{path.name}: there is no row of data, only {len(lines)} blank or comment lines; copy it again")
     header, separator, above, first = _find_header(path, lines, content)
@@ -115,7 +119,7 @@ def _decode(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list
     if not complete and len(lines) > 1:
         lines.pop()  # the last one may be cut
     try:
-        text = [line.decode("utf-8-sig" if index == 0 else "utf-8") for index, line in enumerate(lines)]
+        text = b"\n".join(lines).decode("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
         number = next(index for index, line in enumerate(lines) if not _is_utf8(line)) + 1
         notes.append(f"line {number} is not UTF-8 ({error.object[error.start : error.start + 1]!r}); the text was read as Latin-1")

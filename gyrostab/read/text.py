@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from io import BufferedReader
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 
@@ -126,6 +127,8 @@ def _open(path: Path) -> IO[bytes]:
 
 def _chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
     """Up to `size` bytes, short only at the end of the file."""
+    if isinstance(file, BufferedReader):
+        return file.read(size)
     parts: list[bytes] = []
     missing = size
     try:
@@ -153,7 +156,7 @@ def _blocks(path: Path, offset: int) -> Iterator[bytes]:
                 if len(rest) > 4 * BLOCK_BYTES:
                     raise FormatError(f"{path.name}: a line is longer than {len(rest):,} bytes; this is no text log with line ends")
                 continue
-            yield rest + chunk[:cut]
+            yield b"".join((rest, memoryview(chunk)[:cut]))
             rest = chunk[cut:]
         if rest.strip():
             yield rest + b"\n"

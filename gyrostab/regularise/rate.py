@@ -67,14 +67,22 @@ def _recut(stamps: Stamps, size: int) -> Iterator[tuple[NDArray[np.int64], NDArr
         waiting += len(block[0])
         if waiting < size:
             continue
-        rows, values = (np.concatenate(column) for column in zip(*held, strict=True))
+        rows, values = _in_one(held)
         whole = waiting // size * size
         for begin in range(0, whole, size):
             yield rows[begin : begin + size], values[begin : begin + size]
         held, waiting = [(rows[whole:], values[whole:])], waiting - whole
     if waiting:
-        rows, values = (np.concatenate(column) for column in zip(*held, strict=True))
-        yield rows, values
+        yield _in_one(held)
+
+
+def _in_one(held: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Blocks of rows and stamps one after the other; a single one, or what alone is not empty, is not copied."""
+    held = [block for block in held if len(block[0])]
+    if len(held) == 1:
+        return held[0]
+    rows, values = (np.concatenate(column) for column in zip(*held, strict=True))
+    return rows, values
 
 
 def _pools(stamps: Stamps, *, size: int = 8192, most: int = 64) -> list[NDArray[np.int64]]:
