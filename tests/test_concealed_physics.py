@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from gyrostab.concealed import coil, floor, light, loop, telemetry, tool, vibration
+from gyrostab.concealed import coil, electronics, floor, light, loop, telemetry, tool, vibration
 from gyrostab.concealed.naive import allan_band, allan_variance, band_excess, log_allan, octaves
 
 
@@ -212,3 +212,10 @@ def test_toolface_turns_earth_and_gravity_together():
     np.testing.assert_allclose(np.hypot(x, y), 9.0)
     gx, gy, _ = tool.gravity(angle, inclination=40.0)
     np.testing.assert_allclose(gx * y, gy * x, atol=1e-9)
+
+
+@pytest.mark.parametrize("corner", [0.3, 0.8])
+def test_level_below_a_low_pass_is_what_long_means_of_it_have(corner):
+    common = electronics._low_passed(np.random.default_rng(1), 400_000, corner=corner)
+    means = common.reshape(-1, 50).mean(axis=1) * np.sqrt(50.0)
+    assert means.std() == pytest.approx(electronics._level_below(corner), rel=0.03)

@@ -119,6 +119,12 @@ def _low_passed(rng: np.random.Generator, size: int, *, corner: float) -> Array:
     return np.asarray(common / common.std())
 
 
+def _level_below(corner: float) -> float:
+    """Level of `_low_passed` noise far below its corner, as an amplitude: what a random walk of the angle at long times has of it."""
+    f = (np.arange(4000) + 0.5) / 4000
+    return float(1 / np.sqrt(np.mean(1 / (1 + (f / corner) ** 4))))
+
+
 def shared_source(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """Excess noise of one source in all axes; no axis by itself shows it."""
     coloured = rng.random() < 0.5
@@ -131,6 +137,7 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
     rho = min(rho, 0.8)
     shares = shares * math.sqrt(rho)
     common = _low_passed(rng, world.size, corner=corner) if coloured else rng.standard_normal(world.size)
+    below = _level_below(corner) if coloured else 1.0
     own = np.stack([rng.standard_normal(world.size) for _ in AXES])
     size = shared_size(world, rho * pairs)
     return Effect(
@@ -146,7 +153,7 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
         parameters={
             "correlation": {"value": float(np.abs(rho * pairs).max()), "unit": "1"},
             "N": {
-                "values": {a: abs(float(r)) * n["N"] for a, r, n in zip(AXES, shares, world.noise, strict=True) if r},
+                "values": {a: abs(float(r)) * n["N"] * below for a, r, n in zip(AXES, shares, world.noise, strict=True) if r},
                 "unit": "deg/sqrt(h)",
             },
         },

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,11 +12,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.candidates import Variant
-from gyrostab.diagnose.effects.cells import State, begin_state, harmonic_sets, pair_rows
+from gyrostab.diagnose.effects.cells import State, begin_state, harmonic_sets
 from gyrostab.diagnose.effects.explained import Part, explain_away, mirrored
 from gyrostab.diagnose.effects.response import is_filter
 from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
 from gyrostab.diagnose.modelling.levels import level_sizes
+from gyrostab.diagnose.modelling.shared import shared_sizes
 from gyrostab.diagnose.naming.filters import filter_sizes
 from gyrostab.diagnose.naming.name import AMBIGUOUS, Claim, Naming
 from gyrostab.diagnose.naming.odd import line_size, mark_sizes
@@ -155,14 +156,16 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
     plain = [plainer(part, state) for part in by_view[view]]
     by_view[view] = [part for part, _ in plain]
     filtered = is_filter(view, by_view[view][0].variant)
-    sizes = {} if filtered else _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
+    sizes: Mapping[str, tuple[float, ...]]
     if filtered:
         sizes, values = filter_sizes(by_view[view], state)
     else:
-        sizes = {**_elsewhere(by_view, view, axes, state, naming), **sizes}
-    for name, (mean, sd) in sizes.items():
+        own = _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
+        sizes = {**_elsewhere(by_view, view, axes, state, naming), **own}
+    for name, (mean, sd, *ends) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
-        estimates[name] = _estimate(mean, sd, unit, positive=_positive(kind, name))
+        if math.isfinite(mean):  # a low-pass of infinite bandwidth is none
+            estimates[name] = _estimate(mean, sd, unit, ends=ends, positive=_positive(kind, name))
         _put(values, name, mean, axes)
     values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
     values |= _words(claim, by_view[view][0], state)
@@ -171,10 +174,10 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
 
 def _elsewhere(
     by_view: Mapping[str, list[Part]], view: str, axes: tuple[str, ...], state: State, naming: Naming
-) -> dict[str, tuple[float, float]]:
+) -> dict[str, tuple[float, ...]]:
     """Sizes on axes that the strongest view says nothing of, from the strongest of the others that does."""
     seen = {axis for part in by_view[view] for axis in part.row}
-    found: dict[str, tuple[float, float]] = {}
+    found: dict[str, tuple[float, ...]] = {}
     for other in sorted(set(by_view) - {view}, key=lambda name: -sum(part.gain for part in by_view[name])):
         lacking = {axis for part in by_view[other] for axis in part.row} - seen
         if lacking:
@@ -236,11 +239,14 @@ def _within(value: Any, low: float, high: float) -> Any:
     return min(max(float(value), low), high)
 
 
-def _estimate(mean: float, sd: float, unit: str, *, positive: bool) -> Estimate:
-    """With the error of the form in it."""
-    total = math.hypot(sd, FORM_ERROR * mean) if sd > 0.0 else 0.0  # what is counted, not measured, is exact
-    low, high = mean - _TWO_SIDED * total, mean + _TWO_SIDED * total
-    return Estimate(mean, total, max(low, 0.0) if positive else low, high, unit)
+def _estimate(mean: float, sd: float, unit: str, *, positive: bool, ends: Sequence[float] = ()) -> Estimate:
+    """With the error of the form in it; `ends` are those of the 95 % interval without it, where that is not symmetric."""
+    if sd <= 0.0:  # what is counted, not measured, is exact
+        return Estimate(mean, 0.0, mean, mean, unit)
+    form = FORM_ERROR * mean
+    low, high = ends or (mean - _TWO_SIDED * sd, mean + _TWO_SIDED * sd)
+    low, high = mean - math.hypot(mean - low, _TWO_SIDED * form), mean + math.hypot(high - mean, _TWO_SIDED * form)
+    return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
 
 
 # ---------------------------------------------------------------------------------------------------------------- sizes
@@ -314,36 +320,8 @@ def _root(square: float, sd: float) -> tuple[float, float]:
     return value, sd / (2.0 * value) if square > sd else math.sqrt(max(square, 0.0) + sd) - value
 
 
-def _common(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
-    """Factor of every axis from the products of pairs."""
-    name = parts[0].variant.columns[0]
-    pairs = [pair for pair in pair_rows(state.reduced) if set(pair) <= set(axes)]
-    variant = parts[0].variant
-    product, error = np.zeros((len(axes), len(axes))), np.zeros((len(axes), len(axes)))
-    for pair in pairs:
-        mean, covariance = part_mixture(replace(parts[0], row=pair), state, variant).moments()
-        i, j = axes.index(pair[0]), axes.index(pair[1])
-        product[i, j] = product[j, i] = mean[0]
-        error[i, j] = error[j, i] = math.sqrt(covariance[0, 0])
-    best = _factors(product)
-    rng = np.random.default_rng(0)
-    draws = []
-    for _ in range(200):
-        noise = np.triu(rng.standard_normal(product.shape), 1) * error
-        one = _factors(product + noise + noise.T)
-        draws.append(one if one @ best >= 0 else -one)
-    spread = np.std(draws, axis=0)
-    return {name if len(axes) == 1 else f"{name}.{axis}": (float(best[k]), float(spread[k])) for k, axis in enumerate(axes)}
-
-
-def _factors(product: Array) -> Array:
-    """Factors whose products are nearest to a matrix off its diagonal, the largest positive."""
-    matrix = product.copy()
-    for _ in range(50):
-        values, vectors = np.linalg.eigh(matrix)
-        factor = vectors[:, -1] * math.sqrt(max(values[-1], 0.0))
-        np.fill_diagonal(matrix, factor**2)
-    return np.asarray(factor * np.sign(factor[np.abs(factor).argmax()] or 1.0))
+def _common(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
+    return shared_sizes(parts, axes, state)
 
 
 def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
@@ -388,4 +366,10 @@ def _levels(parts: list[Part], axes: tuple[str, ...], state: State, naming: Nami
     return level_sizes(parts, axes, state)
 
 
-_SIZES = {"cross": _common, "order": _turning, "line": _line, "marks": _odd, "levels": _levels}
+_SIZES: Mapping[str, Callable[..., Mapping[str, tuple[float, ...]]]] = {
+    "cross": _common,
+    "order": _turning,
+    "line": _line,
+    "marks": _odd,
+    "levels": _levels,
+}
