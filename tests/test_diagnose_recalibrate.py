@@ -101,7 +101,7 @@ def test_what_axes_share_is_no_noise_of_their_own():
         assert noise_of(baseline, "N", axis)[0] > 1.15 * 0.003
         value, error = noise_of(after, "N", axis)
         assert abs(value - 0.003) < 3.0 * error
-        assert error < 0.1 * value
+        assert error < 0.2 * value  # one pair of axes tells the product of what they share, not the part of either
     np.testing.assert_allclose(after["spectrum"].median(), baseline["spectrum"].median(), rtol=0.05)
 
 
