@@ -1,0 +1,45 @@
+"""Effects that are named more than once on an axis."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import Candidate, Variant
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.naming.layers import layers
+from gyrostab.diagnose.naming.name import name_effects
+from gyrostab.diagnose.naming.parts import gain_of
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.simulate import simulate
+
+VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
+
+
+def part(gain, *, row="x", witness=""):
+    return Part(Candidate("misalignment", "transfer", (), (VARIANT,), witness=(witness,)), VARIANT, (row,), gain)
+
+
+def test_rows_that_come_again_are_a_layer_of_their_own():
+    parts = [part(9.0), part(8.0, row="y"), part(7.0), part(6.0, witness="seismometer"), part(5.0)]
+    assert [[one.gain for one in layer] for layer in layers(parts)] == [[9.0, 8.0, 6.0], [7.0], [5.0]]
+
+
+def test_a_part_has_no_gain_of_another_witness():
+    parts = [part(40.0, witness="z"), part(9.0, witness="seismometer")]
+    assert [gain_of(parts, part(1.0, witness=name)) for name in ("z", "seismometer", "y")] == [40.0, 9.0, 1.0]
+
+
+def test_two_opposite_jumps_gain_together_what_none_gains_alone():
+    jumps = [{"name": "bias_jump", "step": [step], "at": at, "axes": ["x"]} for step, at in ((0.3, 600.0), (-0.3, 1300.0))]
+    model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003, "K": 0.005}, "effect": jumps}
+    reduced = reduce_log(simulate(model, duration="30min", rate=10.0, seed=4).compute())
+    baseline = calibrate(reduced)
+    nulls = list(null_records(reduced, baseline, count=40, rng=np.random.default_rng(1), chunk=40))
+    (claim,) = name_effects(reduced, baseline, nulls).claims
+    assert claim.effect == "bias_jump"
+    assert len({one.variant.values["at"] for one in claim.parts}) == len(claim.parts) > 1
+    assert claim.gain == pytest.approx(sum(one.gain for one in claim.parts))
+    assert claim.gain > 1.5 * max(one.gain for one in claim.parts)
