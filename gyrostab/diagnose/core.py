@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
+from gyrostab.diagnose.calibration.known import without_known_lines
 from gyrostab.diagnose.conclusion.account import explanations
 from gyrostab.diagnose.conclusion.content import (
     baseline_table,
@@ -145,6 +146,7 @@ def _diagnose(
     def compared(reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset, Naming, NullScores]:
         progress("calibrating", 0)
         baseline = _baseline(reduced, given, quiet, restart_gap, progress)
+        reduced = without_known_lines(reduced, baseline)
         records = _records(reduced, baseline, nulls, seed)
         progress("comparing", 0)
         null = null_scores(baseline, records())

@@ -274,6 +274,9 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
     out = assemble(reduced, found, quiet=quiet, attrs=attrs, known_mean=known.mean + ramp[:, None] * hours, spectrum=known.spectrum)
     if known.cross is not None:
         out["cross"] = (("pair", "block", "band"), known.cross, {"long_name": "expected cross-spectrum", "units": _POWER})
+    for name, values in known.lines.items():
+        last = "band" if name == "line_spectrum" else "line"
+        out[name] = (("axis", last), values, {"long_name": "expected power of lines", "units": _POWER})
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"][:] = 0.0
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,15 +12,21 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.calibration.expected import NOISE, band_columns
 from gyrostab.diagnose.effects.candidates import windows_of
-from gyrostab.diagnose.effects.cells import effective, pair_rows
+from gyrostab.diagnose.effects.cells import effective, in_place, pair_rows
 from gyrostab.diagnose.effects.response import inside_bands, response_of
+from gyrostab.diagnose.gains.lines import LEAK, expected_lines
+from gyrostab.kernels.periodogram import ordinates, taper
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.prediction import Prediction
 from gyrostab.simulate.model import Model
 
-__all__ = ["Known", "drivers_of", "known_effects"]
+__all__ = ["Known", "drivers_of", "known_effects", "without_known_lines"]
 
 Array = NDArray[np.float64]
+_REACH, _BETWEEN = 100, 4  # ordinates on either side that a line leaks into; places of it between one and the next, on either side
+_SIZE_ERROR = 0.1  # of the power of a known line: twice the share of its amplitude by which a form may be wrong, and more
+_CHANCE = 5.0  # standard deviations
+_SLIGHT = 0.1  # of the noise, below which what leaks from a line is taken off as it is
 
 
 class Known(NamedTuple):
@@ -33,6 +40,10 @@ class Known(NamedTuple):
         Expected power of noise and effects [degree2 hour-2 Hz-1].
     cross : ndarray of complex, shape (pair, block, band), or None
         Expected cross-spectrum [degree2 hour-2 Hz-1]; None where the axes share nothing.
+    lines : dict of str to ndarray
+        At full resolution (axis, line): steady ``lines``, the most that each ordinate may have of them (``lines_most``), and ``peaks``
+        of some width. And ``line_spectrum`` (axis, band): what they have in the bands, at their own place [degree2 hour-2 Hz-1].
+        Empty without any.
     left_out : list of str
         Effects that show elsewhere too.
     """
@@ -40,6 +51,7 @@ class Known(NamedTuple):
     mean: Array
     spectrum: Array
     cross: NDArray[np.complex128] | None
+    lines: dict[str, Array]
     left_out: list[str]
 
 
@@ -64,6 +76,7 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Known:
     added, response, left_out = np.zeros((len(axes), blocks, bands)), np.ones((len(axes), 1, bands)), []
     pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(reduced)] if "cross" in reduced else []
     shared = np.zeros((len(pairs), blocks, bands), np.complex128)
+    narrow: list[tuple[Effect, list[int], Array]] = []
     for effect in model.effects:
         rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
         own = tuple(axes[row] for row in rows)
@@ -80,6 +93,8 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Known:
             added += np.abs(factor[:, None, None]) ** 2 * density
             for number, (one, other) in enumerate(pairs if seen.coherent else ()):
                 shared[number] += factor[one] * np.conj(factor[other]) * np.sqrt(density[one] * density[other])
+            if seen.line is not None and factor.any():
+                narrow.append((effect, rows, np.abs(factor[:, None, None]) ** 2 * density))
         if seen.response is not None:
             response[rows] *= response_of(effect, reduced)
         elsewhere = seen.marks or seen.wander or seen.transfer or seen.order or seen.phase_locked
@@ -89,7 +104,73 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Known:
     for number, (one, other) in enumerate(pairs):
         shared[number] *= np.sqrt(response[one] * response[other])
     cross = effective(shared, reduced, "pair") if shared.any() else None
-    return Known(mean, effective(spectrum, reduced), cross, left_out)
+    lines = _known_lines(reduced, narrow, response[:, 0]) if narrow and "line_power" in reduced else {}
+    return Known(mean, effective(spectrum, reduced), cross, lines, left_out)
+
+
+def _known_lines(reduced: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array) -> dict[str, Array]:
+    """Lines of effects (with their axes, and their power in the bands), behind a filter (axis, band), as `Known.lines` has them."""
+    axes = [str(axis) for axis in reduced["axis"].values]
+    frequency, bands = reduced["line_frequency"].values, reduced["frequency"].values
+    passed = np.stack([np.interp(np.log(frequency), np.log(bands), one) for one in response])
+    steady, most, broad = (np.zeros(passed.shape) for _ in range(3))
+    near, own = in_place(reduced)[..., None], np.zeros((len(axes), bands.size))
+    leak = _leak(int(reduced.attrs["block_samples"]))
+    for effect, rows, density in narrow:
+        chosen = tuple(axes[row] for row in rows)
+        seen = _explained(effect, reduced, chosen, frequency)
+        own += (near * density).mean(axis=1) * response
+        for name, values in seen.spectrum.items():
+            size = np.abs(_factors(effect, name, chosen)[:, None]) ** 2 * values.mean(axis=-2)
+            places = 0 if seen.line is None else seen.line.size // reduced.sizes["block"]
+            alone = np.count_nonzero(values, axis=-1).max() <= places
+            own_leak = leak[1]
+            if alone and places == 1 and seen.line is not None and np.ptp(seen.line) == 0.0:
+                apart = float(seen.line.flat[0]) - frequency[int(np.argmax(values.reshape(-1, frequency.size)[0]))]
+                own_leak = _leak(int(reduced.attrs["block_samples"]), apart * float(reduced.attrs["block_s"]))[0]
+            for row, one in zip(rows, size * passed[rows], strict=True):
+                (steady if alone else broad)[row] += np.convolve(one, own_leak if alone else leak[0], "same")
+                most[row] += np.convolve(one, leak[2], "same") if alone else 0.0
+    return {"lines": steady, "lines_most": most, "peaks": broad, "line_spectrum": own}
+
+
+def _leak(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
+    """Share of a line in the ordinates about it, so far `apart` from the middle one; the mean over such places, and the most at any."""
+    weights = taper(size)
+    reach = min(_REACH, ordinates(size) // 2)
+    finer = 2 * _BETWEEN
+    turned = weights * np.exp(2j * np.pi * apart * np.arange(size) / size)
+    padded = np.abs(np.fft.fft(turned, size * finer)) ** 2 / (size * (weights**2).sum())
+    place = np.arange(-reach, reach + 1) * finer
+    inside = padded[place[:, None] + np.arange(-_BETWEEN, _BETWEEN + 1)]
+    ends = np.array([0.5, *[1.0] * (2 * _BETWEEN - 1), 0.5])
+    return inside[:, _BETWEEN], np.average(inside, axis=1, weights=ends), inside.max(axis=1)
+
+
+def without_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+    """The record with its line spectrum freed of the steady lines that the baseline knows.
+
+    A line is left as it is above what is known of it where it is stronger than the form of an effect may be wrong and the noise
+    beside it may do.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+    """
+    if "lines" not in baseline:
+        return reduced
+    power, weight = reduced["line_power"].transpose("axis", "part", "line"), reduced["line_weight"].transpose("axis", "part")
+    noise = expected_lines(baseline, reduced["line_frequency"].values)[:, None]
+    known, most = (baseline[name].values[:, None] for name in ("lines", "lines_most"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scatter = np.sqrt((noise**2 + 2.0 * noise * most) / weight.values[..., None])
+    above = power.values - noise - known
+    stands = power.values - noise - most > _SIZE_ERROR * most + _CHANCE * scatter
+    beside = np.pad(stands, ((0, 0), (0, 0), (LEAK, LEAK)))
+    stands = np.lib.stride_tricks.sliding_window_view(beside, 2 * LEAK + 1, axis=-1).any(axis=-1)  # with what it leaks into
+    freed = noise + np.where(stands | (most < _SLIGHT * noise), above, 0.0)
+    freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
+    return reduced.assign(line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan)))
 
 
 def drivers_of(effect: Effect) -> dict[str, str]:
@@ -97,14 +178,16 @@ def drivers_of(effect: Effect) -> dict[str, str]:
     return {role: effect.channel_names()[role] for role in effect.needs()}
 
 
-def _explained(effect: Effect, reduced: xr.Dataset, axes: tuple[str, ...]) -> Prediction:
+def _explained(effect: Effect, reduced: xr.Dataset, axes: tuple[str, ...], frequency: Array | None = None) -> Prediction:
     """What an effect predicts for the record on some of its axes; spectra at many frequencies in each band, since a peak may be narrow."""
     drivers = drivers_of(effect)
     present = [str(name).removeprefix("channel_") for name in reduced.data_vars if str(name).startswith("channel_")]
     for role, name in drivers.items():
         if name not in present:
             raise driver_error(effect, role, present)
-    return effect.explain(replace(windows_of(reduced, drivers), axes=axes, frequency=inside_bands(reduced)))
+    return effect.explain(
+        replace(windows_of(reduced, drivers), axes=axes, frequency=inside_bands(reduced) if frequency is None else frequency)
+    )
 
 
 def _sizes(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:

@@ -25,10 +25,13 @@ _WIDEST = 40
 
 
 def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
-    """Mean density of the baseline at frequencies [Hz], (axis, line) [degree2 hour-2 Hz-1]."""
+    """Mean density of the baseline at frequencies [Hz], (axis, line) [degree2 hour-2 Hz-1], without steady lines that it knows."""
     spectrum = baseline["spectrum"].mean("block").transpose("axis", "band").values
     bands = np.log(baseline["frequency"].values)
-    return np.stack([np.exp(np.interp(np.log(frequency), bands, np.log(row))) for row in spectrum])
+    if "line_spectrum" in baseline:
+        spectrum = np.maximum(spectrum - baseline["line_spectrum"].values, _LOWEST * spectrum)
+    smooth = np.stack([np.exp(np.interp(np.log(frequency), bands, np.log(row))) for row in spectrum])
+    return smooth + baseline["peaks"].values if "peaks" in baseline else smooth
 
 
 def line_gains(power: Array, weight: Array, expected: Array | None = None) -> Array:

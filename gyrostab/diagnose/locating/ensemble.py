@@ -203,8 +203,14 @@ def _lines(frame: _Frame, squares: Array, rng: np.random.Generator) -> Array:
         if not (chosen.any() and weight[axis, part] > 0.0):
             continue
         share = near[axis, chosen].mean()
-        effects = np.interp(frequency, bands, frame.effects[axis, chosen].mean(axis=0))
+        over = frame.effects[axis, chosen].mean(axis=0)
+        if "line_spectrum" in frame.baseline:
+            noise = (frame.columns[axis, chosen] @ frame.baseline["square"].values[axis]).mean(axis=0)
+            over = np.maximum(over - frame.baseline["line_spectrum"].values[axis] / noise, 0.01 * over)
+        effects = np.interp(frequency, bands, over)
         out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
+        if "peaks" in frame.baseline:
+            out[:, axis, part] += frame.baseline["peaks"].values[axis]
     return _leaked(_gamma(weight[..., None], np.ones(out.shape), rng), int(reduced.attrs["block_samples"])) * out
 
 

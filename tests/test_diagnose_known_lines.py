@@ -1,0 +1,84 @@
+"""A recording against a model with lines: what the model knows is no line, and what is beyond it is one."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import gyrostab
+from gyrostab.diagnose.calibration.baseline import from_model
+from gyrostab.diagnose.calibration.known import without_known_lines
+from gyrostab.diagnose.gains.lines import expected_lines, line_gains
+from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.views.spectrum import score
+from gyrostab.simulate import simulate
+
+NOISE = {"N": 0.003, "K": 0.02}
+SIZE, PLACE = 0.3, 1.337
+
+
+def model(size: float, **more: object) -> dict[str, object]:
+    line = [{"name": "spectral_line", "amplitude": size, "frequency": PLACE, **more}] if size else []
+    return {"noise": NOISE, "effect": line, "log": {"axes": ["x", "y"]}}
+
+
+@cache
+def log_of(seed: int, size: float) -> xr.Dataset:
+    return simulate(model(size), duration="30min", rate=10.0, seed=seed).compute()
+
+
+def gain(reduced: xr.Dataset, baseline: xr.Dataset) -> float:
+    expected = expected_lines(baseline, reduced["line_frequency"].values)
+    return float(line_gains(reduced["line_power"].values[None], reduced["line_weight"].values, expected).max())
+
+
+@pytest.mark.parametrize("amplitude", [0.03, 0.3, 3.0])
+@pytest.mark.parametrize("frequency", [1.3, 1.312, 1.325])
+def test_a_known_line_is_gone_wherever_it_lies_between_ordinates(amplitude, frequency):
+    line = {"name": "spectral_line", "amplitude": amplitude, "frequency": frequency}
+    made = {"noise": NOISE, "effect": [line], "log": {"axes": ["x"]}}
+    reduced = reduce_log(simulate(made, duration="30min", rate=10.0, seed=7).compute())
+    baseline = from_model(reduced, made)
+    freed = without_known_lines(reduced, baseline)
+    assert gain(freed, baseline) < 6.0
+    assert float(np.nanmax(score(freed, baseline)["z"])) < 5.0
+    if amplitude > 0.1:
+        assert gain(reduced, from_model(reduced, model(0.0) | {"log": {"axes": ["x"]}})) > 50.0
+
+
+def test_a_line_that_is_a_little_off_the_model_is_not_told_and_a_stronger_one_is():
+    baseline = from_model(reduce_log(log_of(1, SIZE)), model(SIZE))
+    assert gain(without_known_lines(reduce_log(log_of(1, 1.03 * SIZE)), baseline), baseline) < 6.0
+    assert gain(without_known_lines(reduce_log(log_of(1, 1.5 * SIZE)), baseline), baseline) > 20.0
+
+
+def test_null_records_have_the_peaks_of_the_model():
+    made = model(0.5, quality=30.0)
+    reduced = reduce_log(simulate(made, duration="1h", rate=10.0, seed=2).compute())
+    baseline = from_model(reduced, made)
+    nulls = next(iter(null_records(reduced, baseline, count=25, rng=np.random.default_rng(1))))
+    drawn = nulls["line_power"].isel(axis=0).mean(["record", "part"])
+    seen = reduced["line_power"].isel(axis=0).mean("part")
+    near = np.abs(reduced["line_frequency"].values - PLACE) < 0.1
+    assert float(seen[near].sum()) == pytest.approx(float(drawn[near].sum()), rel=0.25)
+    assert float(drawn[near].max()) > 5.0 * float(drawn[~near].median())
+    far = np.abs(reduced["line_frequency"].values - PLACE) > 0.3
+    assert float((seen[far] / drawn[far]).mean()) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("seed", "inside", "known", "left"), [(2, SIZE, SIZE, 0.0), (3, SIZE, 0.0, SIZE), (4, 2 * SIZE, SIZE, 3**0.5 * SIZE)]
+)
+def test_the_power_beyond_the_model_is_named(seed, inside, known, left):
+    found = gyrostab.diagnose(log_of(seed, inside), simulation=model(known), nulls=100)
+    if not left:
+        assert found.verdict == "no mismatch", found.content["mismatches"]
+        return
+    assert [effect["name"] for effect in found.effects] == ["spectral_line"]
+    for axis in "xy":
+        assert found.effects[0]["parameters"][f"amplitude.{axis}"]["value"] == pytest.approx(left, rel=0.1)
+    assert found.effects[0]["parameters"]["frequency"]["value"] == pytest.approx(PLACE, abs=0.03)
