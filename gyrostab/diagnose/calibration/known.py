@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -77,7 +77,7 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Known:
     pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(reduced)] if "cross" in reduced else []
     shared = np.zeros((len(pairs), blocks, bands), np.complex128)
     narrow: list[tuple[Effect, list[int], Array]] = []
-    for effect in model.effects:
+    for effect in map(_simulated(model), model.effects):
         rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
         own = tuple(axes[row] for row in rows)
         seen = _explained(effect, reduced, own)
@@ -171,6 +171,12 @@ def without_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset
     freed = noise + np.where(stands | (most < _SLIGHT * noise), above, 0.0)
     freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
     return reduced.assign(line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan)))
+
+
+def _simulated(model: Model) -> Callable[[Effect], Effect]:
+    """Effects as the model simulates them: a filter works at the rate of the model's instrument."""
+    instrument = float(model.log.get("oversampling", 1))
+    return lambda effect: replace(effect, instrument=instrument) if hasattr(effect, "instrument") else effect
 
 
 def drivers_of(effect: Effect) -> dict[str, str]:

@@ -30,6 +30,7 @@ from gyrostab.diagnose.modelling.refit import Fitted
 from gyrostab.diagnose.naming.name import Claim, Naming, Unknown
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.noise import LAWS
+from gyrostab.physics.base import Effect
 from gyrostab.simulate.model import Model
 
 __all__ = [
@@ -51,6 +52,7 @@ __all__ = [
 Array = NDArray[np.float64]
 _TAIL = 0.25
 _LEAST_P = 1e-12
+_FAST = 16  # samples of an instrument that is much faster than the log
 #: Generic -> view in which it is told.
 _GENERIC_VIEW = {"~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution"}
 #: Where an effect shows -> view in which it is told.
@@ -282,8 +284,16 @@ def model_tables(baseline: xr.Dataset, fitted: Sequence[Fitted], own: Model | No
         str(axis): {str(term): float(f"{float(baseline['coefficient'].sel(axis=axis, term=term)):.6g}") for term in baseline["term"].values}
         for axis in baseline["axis"].values
     }
-    before = [effect_table(effect) for effect in own.effects] if own is not None else []
-    return {"noise": noise, "effect": [*before, *(effect_table(one.effect) for one in fitted if one.effect is not None)]}
+    before = list(own.effects) if own is not None else []
+    found = [one.effect for one in fitted if one.effect is not None]
+    instrument = max([int(own.log.get("oversampling", 1)) if own is not None else 1, *map(_instrument, found)])
+    log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
+    return {**log, "noise": noise, "effect": [effect_table(effect) for effect in [*before, *found]]}
+
+
+def _instrument(effect: Effect) -> int:
+    """Samples of the instrument in one of the log that an effect needs: a filter works at the rate of the instrument."""
+    return int(getattr(effect, "instrument", 1)) or _FAST
 
 
 def verdict(mismatches: Sequence[Mapping[str, Any]], claims: Sequence[Claim], unexplained: Sequence[int]) -> str:
