@@ -17,6 +17,7 @@ from gyrostab.diagnose.effects.response import inside_bands, response_of
 from gyrostab.diagnose.gains.lines import LEAK, expected_lines
 from gyrostab.kernels.periodogram import ordinates, taper
 from gyrostab.physics.base import Effect, driver_error
+from gyrostab.physics.logger import LoggerFilter
 from gyrostab.physics.prediction import Prediction
 from gyrostab.simulate.model import Model
 
@@ -176,7 +177,7 @@ def without_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset
 def _simulated(model: Model) -> Callable[[Effect], Effect]:
     """Effects as the model simulates them: a filter works at the rate of the model's instrument."""
     instrument = float(model.log.get("oversampling", 1))
-    return lambda effect: replace(effect, instrument=instrument) if hasattr(effect, "instrument") else effect
+    return lambda effect: replace(effect, instrument=instrument) if isinstance(effect, LoggerFilter) else effect
 
 
 def drivers_of(effect: Effect) -> dict[str, str]:
