@@ -34,3 +34,30 @@ def test_what_the_simulation_lacks_is_named():
     assert effect["name"] == "vibration_noise"
     assert effect["parameters"]["white"]["low"] < 0.0006 < effect["parameters"]["white"]["high"]
     assert found.model["noise"]["x"]["N"] == pytest.approx(0.003, rel=0.1)
+
+
+SHARED = {"name": "shared_source", "N": 0.0015, "axes": ["x", "y"]}
+LINE = {"name": "spectral_line", "amplitude": 0.3, "frequency": 1.337, "axes": ["x"]}
+BUMP = {"name": "spectral_line", "amplitude": 0.5, "frequency": 2.6, "quality": 8.0, "axes": ["y"]}
+
+
+@cache
+def axes_log(seed: int, *names: str):
+    effects = {"shared_source": SHARED, "line": LINE, "bump": BUMP}
+    model = {"noise": NOISE, "effect": [effects[name] for name in names], "log": {"axes": ["x", "y"]}}
+    return simulate(model, duration="25min", rate=10.0, seed=seed).compute()
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_what_a_simulation_shows_all_the_time_is_no_mismatch(seed):
+    names = ("shared_source", "line", "bump")
+    found = gyrostab.diagnose(axes_log(seed, *names), simulation=axes_log(seed + 100, *names), nulls=100)
+    assert found.verdict == "no mismatch"
+
+
+@pytest.mark.parametrize("lacking", ["shared_source", "line"])
+def test_what_a_simulation_lacks_beside_what_it_shows_is_named(lacking):
+    names = ("shared_source", "line", "bump")
+    simulation = axes_log(111, *(name for name in names if name != lacking))
+    found = gyrostab.diagnose(axes_log(11, *names), simulation=simulation, nulls=100)
+    assert [effect["name"] for effect in found.effects] == [{"line": "spectral_line"}.get(lacking, lacking)]

@@ -17,6 +17,7 @@ from gyrostab.diagnose.calibration.expected import NOISE, common_variance, noise
 from gyrostab.diagnose.calibration.known import known_effects
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
 from gyrostab.diagnose.calibration.quiet import loudness, quiet_blocks, quiet_spans
+from gyrostab.diagnose.calibration.simulated import odd_band, shown_by, with_shown
 from gyrostab.diagnose.gains.products import mean_products
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import HOUR, LAWS, TERMS
@@ -31,6 +32,7 @@ DRAWS = 512
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
 _LOW_SHAPE = 20.0  # of the lowest bands, which say how noisy the mean of a block is
 _EXCESS = 4.0  # standard deviations from which on a block is noisier
+_LEAST_BANDS = 6  # that five noise terms are fitted to, whatever the form of a simulated spectrum
 _POWER = "degree2 hour-2 Hz-1"
 
 
@@ -285,6 +287,7 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
 def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset) -> xr.Dataset:
     """Baseline of a simulated log: its noise with the error of calibrating it, and its level over time where that changes.
 
+    What it shows all the time beside the five noise terms is taken as measured: the form of its spectrum, what axes share, steady lines.
     What a simulation does to the means over time cannot be told from its random walk, so it is not taken as known; `from_model` takes it.
 
     Parameters
@@ -305,13 +308,35 @@ def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset) -> xr.Dataset:
         if wanted != got:
             raise SchemaError(f"simulation: {name} {got}, but {wanted} in the recording; simulate with --like RECORDING")
     chosen, reason = quiet_blocks(simulated)
-    found = _posteriors(simulated, chosen)
-    plain = np.einsum("abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in found]))
+    found, level, odd = _explained(simulated, chosen)
+    plain = np.einsum("abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in found])) * level[..., None]
+    shown = shown_by(simulated, plain, odd)
+    noise = np.einsum("abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found]))
+    attrs = {"source": "simulation", "calibrated_on": quiet_spans(simulated, chosen), "quiet_by": reason}
+    spectrum = noise * level[..., None] * shown.form[:, None]
+    return with_shown(assemble(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum), shown, reduced)
+
+
+def _explained(simulated: xr.Dataset, chosen: NDArray[np.bool_]) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:
+    """Noise of every axis from the bands that it explains, its level over time (axis, block), and the other bands (axis, band)."""
+    columns = noise_powers(simulated)
+    odd = np.zeros((simulated.sizes["axis"], simulated.sizes["band"]), np.bool_)
+    while True:
+        there = simulated.assign(power=simulated["power"].where(~xr.DataArray(odd, dims=("axis", "band"))))
+        found = _posteriors(there, chosen)
+        plain = np.einsum("abfn,an->abf", columns, np.stack([one.square for one in found]))
+        level = _level(there, plain)
+        more = odd_band(there, plain * level[..., None]) & (odd.sum(axis=1, keepdims=True) < odd.shape[1] - _LEAST_BANDS)
+        if not more.any():
+            return found, level, odd
+        odd |= more
+
+
+def _level(simulated: xr.Dataset, plain: Array) -> Array:
+    """Power of every block over that of the noise terms (axis, block, band), (axis, block); 1 where chance may do as much."""
     power, shape = (simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape"))
     level = np.ones(plain.shape[:2])
     for row in range(len(plain)):
         risen, deviation = loudness(power[row] / plain[row] - 1.0, shape[row])
         level[row] = np.where(deviation > _EXCESS, risen, 1.0)
-    spectrum = np.einsum("abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found])) * level[..., None]
-    attrs = {"source": "simulation", "calibrated_on": quiet_spans(simulated, chosen), "quiet_by": reason}
-    return assemble(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum)
+    return level

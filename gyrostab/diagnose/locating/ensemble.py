@@ -129,11 +129,17 @@ def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
     squares = np.stack([baseline["posterior"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1)
     slow = np.stack([baseline["posterior_slow"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1)
     expected = np.einsum("abfn,ran->rabf", frame.columns, squares) * frame.effects
+    if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
+        form = _ordered(baseline, "form_shape", "axis", "band")
+        expected *= _gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
     if frame.shared is None:
         power, between = _gamma(baseline["shape_alone"].values, expected, rng), np.empty(0, np.complex128)
     else:
         power, between = shared_spectra(frame.shared, count, rng)
         power *= expected
+        if "cross_error" in baseline:
+            error = _ordered(baseline, "cross_error", "pair", "band")
+            between += (error * (rng.standard_normal((count, *error.shape, 2)) @ np.array([1.0, 1j])))[:, :, None]
     common = baseline["common"].values
     swell = _gamma(np.where(common > 0.0, 1.0 / np.where(common > 0.0, common, 1.0), np.inf), np.ones(power.shape[:3]), rng)[..., None]
     power *= swell
