@@ -28,7 +28,8 @@ _FINE, _ZOOMS = 21, 4
 def without_slopes(passing: list[str], parts: Mapping[str, list[Part]], state: State, folds: xr.DataArray) -> list[str]:
     """Keys without lines that are gone, or nearly so, when the spectrum is straightened by a filter that passes as well.
 
-    A line is judged by its neighbours, so that the steep slope of a filter, or the lobes of an average, look like one.
+    A line is judged by its neighbours, so that the steep slope of a filter, or the lobes of an average, look like one. Lines that
+    stay come before the filter: what they leave in their bands, many of them, has a broad form too.
     """
     lines = [key for key in passing if parts[key][0].candidate.view == "line"]
     filters = [key for key in passing if any(is_filter(part.candidate.view, part.variant) for part in parts[key])]
@@ -38,7 +39,8 @@ def without_slopes(passing: list[str], parts: Mapping[str, list[Part]], state: S
     again = gains(_candidates(parts, lines), trial.reduced, trial, folds)
     left = {one.candidate.key: float(np.maximum(one.gain[0], 0.0).sum()) for one in again}
     before = {key: sum(max(part.gain, 0.0) for part in parts[key]) for key in lines}
-    return [key for key in passing if key not in lines or left.get(key, 0.0) > _KEPT * before[key]]
+    real = {key for key in lines if left.get(key, 0.0) > _KEPT * before[key]}
+    return [key for key in passing if (key in real if key in lines else key not in filters or not real)]
 
 
 def _candidates(parts: Mapping[str, list[Part]], keys: Iterable[str]) -> list[Candidate]:
