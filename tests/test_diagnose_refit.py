@@ -116,7 +116,8 @@ def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_fro
     place = np.linspace(0.0, 1.0, reduced.sizes["block"])
     g = np.where((place > 0.2) & (place < 0.4), levels[0], np.where((place > 0.6) & (place < 0.8), levels[1], 0.0))
     drawn = next(iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1)))
-    one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + xr.DataArray(0.005 * g**2, dims="block"))
+    shape = xr.DataArray(0.005 * g**2 if column == "sensitivity" else 1e-4 * g**4, dims="block")
+    one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
     one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
     (fitted,) = fit_claims(claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline)
     alike = levels[0] == levels[1]

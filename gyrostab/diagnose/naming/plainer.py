@@ -15,13 +15,14 @@ from gyrostab.diagnose.effects.sizes import part_mixture
 __all__ = ["plainer"]
 
 _ALIKE = 0.999  # correlation of the errors of two terms, from which on they are one to the data
+_AMBIGUOUS = 3.0  # nats by which one term alone must be better than another
 _NEEDED, _FORM = 6.0, 0.01  # nats that a second term must bring, and of the first one's, which an error of its form may leave
 
 
 def plainer(part: Part, state: State) -> tuple[Part, str]:
     """The part with one of its terms, where that does as well as all, and a sentence about it; else the part as it is.
 
-    A part of one term gets the first of those that the data do not tell from it.
+    A part of one term gets the first of those that alone do as well, but for 3 nats and an error of the form.
     Terms that rise and fall together, as g^2 and g^4 at one level of vibration, have sizes that are large, opposite and wrong.
 
     Parameters
@@ -42,10 +43,7 @@ def plainer(part: Part, state: State) -> tuple[Part, str]:
     alone = {name: one for name, one in found if one is not None}
     if not alone:
         return part, ""
-    gains = {}
-    for name, variant in alone.items():
-        size, spread = part_mixture(part, state, variant).moments()
-        gains[name] = 0.5 * float(size[0] ** 2 / spread[0, 0])
+    gains = {name: _alone(part, state, variant) for name, variant in alone.items()}
     best = max(gains.values())
     name = next(name for name in part.variant.columns if gains.get(name, -np.inf) > best - _NEEDED)  # the first that will do
     whole = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
@@ -56,21 +54,22 @@ def plainer(part: Part, state: State) -> tuple[Part, str]:
 
 
 def _first_alike(part: Part, state: State) -> tuple[Part, str]:
-    """A part of one term: by the first of the terms that are one with it to the data, whichever rounding had put ahead."""
+    """A part of one term: by the first of the terms that alone do as well, whichever rounding or chance had put ahead."""
     names = dict.fromkeys(one.columns[0] for one in part.candidate.variants if len(one.columns) == 1)
     terms = [one for name in names if (one := _only(part, name)) is not None]
-    alike = [one for one in terms if one.columns == part.variant.columns or _one_term(part, state, one)]
+    own = _alone(part, state, part.variant)
+    alike = [one for one in terms if one.columns == part.variant.columns or _alone(part, state, one) > own - _AMBIGUOUS - _FORM * own]
     if len(alike) < 2:
         return part, ""
     first, *others = alike
     return replace(part, variant=first), _untold(first.columns[0], [one.columns[0] for one in others])
 
 
-def _one_term(part: Part, state: State, other: Variant) -> bool:
-    """Whether the errors of a part's term and of another one are so much one that the data do not tell the two apart."""
-    both = replace(other, columns=(*other.columns, *part.variant.columns), design=np.concatenate([other.design, part.variant.design]))
-    _, covariance = part_mixture(part, state, both).moments()
-    return bool(abs(covariance[0, 1]) >= _ALIKE * np.sqrt(covariance[0, 0] * covariance[1, 1]))
+def _alone(part: Part, state: State, variant: Variant) -> float:
+    """What a single term gains over none [nats]; nothing where it would take power away."""
+    size, spread = part_mixture(part, state, variant).moments()
+    possible = max(float(size[0]), 0.0) if variant.squared else float(size[0])
+    return 0.5 * possible**2 / float(spread[0, 0])
 
 
 def _untold(name: str, others: Sequence[str]) -> str:
