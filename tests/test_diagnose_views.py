@@ -9,10 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.locating.null_scores import null_scores, standardise
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views import VIEWS, cross_axis, davar, distribution, locked, mean, restart, spectrum
 from gyrostab.diagnose.views.cells import cube_root_score, exponential_score, over_windows, window_set
 from gyrostab.kernels.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
+from gyrostab.log import make_log
 from gyrostab.noise import LAWS
 from tests.reduced_records import BLOCK_S, RATE, baseline, chunks, records
 
@@ -298,3 +301,17 @@ def test_one_axis_has_no_pairs():
     base = baseline(axes="x")
     found = records(base, 2, np.random.default_rng(1))
     assert cross_axis.score(found, base) is None
+
+
+@pytest.mark.parametrize("loud", [(6_050, 12_000), (6_050, 6_540)])
+def test_noise_that_is_loud_for_a_while_is_neither_shared_nor_a_line(loud):
+    largest: dict[str, list[float]] = {"cross_axis": [], "spectrum": []}
+    for seed in range(8):
+        noise = np.random.default_rng(seed).standard_normal((2, 12_000))
+        noise[:, slice(*loud)] *= 8.0
+        found = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="100samples")
+        base = calibrate(found, quiet=np.arange(120) < 60)
+        for name, values in largest.items():
+            values.append(float(np.nanmax(np.abs(VIEWS[name](found, base)["z"].values))))
+    assert max(largest["cross_axis"]) < 4.8
+    assert max(largest["spectrum"]) < 4.8

@@ -165,6 +165,7 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
     lattice = np.array([lattice_step(np.concatenate([kept[row].ravel() for kept in work.kept])) for row in range(work.axes)])
     weight = np.divide(work.line_counts[..., 0] ** 2, work.line_counts[..., 1], where=work.line_counts[..., 1] > 0,
                        out=np.zeros(work.line_counts.shape[:2]))  # fmt: skip
+    weight *= _evenness(work.power[axes], work.shape, present, weight.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         lines = work.line_sum / (work.line_expected * work.rate)
     variables: dict[str, Any] = {
@@ -192,6 +193,23 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
 
 def _named(name: str, units: str) -> dict[str, Any]:
     return {"long_name": name, "units": units}
+
+
+def _evenness(power: Array, shape: Array, samples: NDArray[np.int64], parts: int) -> Array:
+    """Share of the blocks of each part that as many blocks of equal power would be, (axis, part): a few loud ones have all the weight."""
+    good = np.isfinite(power) & np.isfinite(shape) & (shape > 0.0)
+    ordinates = np.where(good, shape, 0.0)
+    known = np.where(good, power, 0.0)
+    usual = (ordinates * known).sum(axis=1, keepdims=True) / np.maximum(ordinates.sum(axis=1, keepdims=True), 1e-300)
+    total = np.maximum(ordinates.sum(axis=2), 1e-300)
+    level = (ordinates * np.divide(known, usual, out=np.zeros_like(known), where=usual > 0.0)).sum(axis=2) / total
+    out = np.ones((len(power), parts))
+    for part in range(parts):
+        mine = np.arange(power.shape[1]) * parts // power.shape[1] == part
+        size, loud = samples[:, mine].astype(np.float64), level[:, mine]
+        square = size.sum(axis=1) * (size * loud**2 * (1.0 - 1.0 / np.maximum(total[:, mine], 2.0))).sum(axis=1)  # less its own scatter
+        out[:, part] = np.divide((size * loud).sum(axis=1) ** 2, square, out=np.ones(len(power)), where=square > 0.0)
+    return np.minimum(out, 1.0)
 
 
 def _ends(moments: Array) -> tuple[Array, Array]:

@@ -72,7 +72,10 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 
 
 def _coherency(reduced: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows) -> tuple[Complex, Array]:
-    """Coherency of each pair by (record), pair, window, band and over all bands last, and the complex ordinates in each."""
+    """Coherency of each pair by (record), pair, window, band and over all bands last, and the complex ordinates in each.
+
+    Where both axes are loud in a few blocks only, these have all the weight: so many blocks of equal power would scatter as much.
+    """
     cross = values_of(reduced, "cross", "pair", "block", "band")
     if "cross" in baseline:
         cross = cross - values_of(baseline, "cross", "pair", "block", "band")
@@ -89,9 +92,11 @@ def _coherency(reduced: xr.Dataset, baseline: xr.Dataset, left: list[int], right
         found = over_windows(np.where(there, values, 0.0) * weight, windows)
         return np.concatenate([found, found.sum(axis=-1, keepdims=True)], axis=-1)
 
-    count = summed(np.ones_like(flat[..., left, :, :])).real
+    one, other = flat[..., left, :, :], flat[..., right, :, :]
+    product = summed(one).real * summed(other).real
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = summed(cross) / np.sqrt(summed(flat[..., left, :, :]) * summed(flat[..., right, :, :]))
+        found = summed(cross) / np.sqrt(product)
+        count = np.fmin(summed(np.ones_like(one)).real, product / summed(one * other).real)
     return np.where(count >= _FEWEST, found, complex(np.nan, np.nan)), count
 
 
