@@ -9,6 +9,7 @@ from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.effects.candidates import Candidate, Variant
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.naming.claims import Claim, with_axes_of
 from gyrostab.diagnose.naming.layers import layers
 from gyrostab.diagnose.naming.name import name_effects
 from gyrostab.diagnose.naming.parts import gain_of
@@ -30,6 +31,16 @@ def test_rows_that_come_again_are_a_layer_of_their_own():
 def test_a_part_has_no_gain_of_another_witness():
     parts = [part(40.0, witness="z"), part(9.0, witness="seismometer")]
     assert [gain_of(parts, part(1.0, witness=name)) for name in ("z", "seismometer", "y")] == [40.0, 9.0, 1.0]
+
+
+def test_a_claim_keeps_the_axes_that_show_it_beside_the_others():
+    parts = (part(9.0), part(8.0, row="y"))
+    claim = Claim("misalignment", (), ("x", "y"), parts, 15.5, 8.0)
+    key = parts[0].candidate.key
+    assert with_axes_of(claim, {key: [part(9.0), part(1.0, row="y")]}).axes == ("x",)
+    assert with_axes_of(claim, {key: [part(9.0), part(1.0, row="y")]}).parts == parts[:1]
+    assert with_axes_of(claim, {key: [part(3.0), part(4.0, row="y")]}) == claim
+    assert with_axes_of(claim, {}) == claim
 
 
 def test_two_opposite_jumps_gain_together_what_none_gains_alone():

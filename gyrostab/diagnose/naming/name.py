@@ -273,7 +273,7 @@ class _Search:
                 break
             state = self._with(start, chosen, one)
             again = by_key(gains(tried_again(one.parts), state.reduced, state, self.folds, tallies=self.tallies))
-            leading = one is chosen[0] and isinstance(one, Claim)
+            leading = one is chosen[0] and isinstance(one, Claim) and one.parts[0].candidate.view != "marks"  # odd samples come first
             if not leading and max((gain_sum(parts) for parts in again.values()), default=0.0) < self.threshold:
                 chosen = [other for other in chosen if other is not one]
             elif isinstance(one, Claim):

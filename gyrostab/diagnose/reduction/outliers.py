@@ -17,6 +17,7 @@ _CLEAR = 64.0  # a lattice is as many times coarser than the last digit
 _RARE = 0.01  # of the values, which may stand off a lattice that is coarse
 _TAILS = 0.1  # of the values, where spikes may be as common as those of the lattice
 _NEAR = 2  # blocks on either side that help to tell a block's own noise
+_LOUDER = 1.5  # times, that a block beside counts as louder
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
 
@@ -24,7 +25,8 @@ def count_outliers(histogram: NDArray[np.uint32], *, sigma: float = _SIGMA) -> N
     """Second differences beyond `sigma` robust standard deviations.
 
     The deviation is from the median: the larger of the block's own and of that which it has together with two neighbours on either
-    side, and at least a tenth of the record's.
+    side, that of the next one where this is louder by half, for the noise may have risen within the block, and at least a tenth of the
+    record's.
 
     Parameters
     ----------
@@ -51,7 +53,11 @@ def count_outliers(histogram: NDArray[np.uint32], *, sigma: float = _SIGMA) -> N
     sums = np.concatenate([np.zeros_like(histogram[:, :1], dtype=np.int64), np.cumsum(histogram, axis=1, dtype=np.int64)], axis=1)
     blocks = np.arange(histogram.shape[1])
     near = sums[:, np.minimum(blocks + _NEAR + 1, blocks.size)] - sums[:, np.maximum(blocks - _NEAR, 0)]
-    scale = np.maximum(np.maximum(_deviation(near), _deviation(np.diff(sums, axis=1))), 0.1 * _deviation(sums[:, -1:]))
+    own, wide = _deviation(np.diff(sums, axis=1)), _deviation(near)
+    beside = np.pad(own, ((0, 0), (1, 1)))
+    beside = np.maximum(beside[:, :-2], beside[:, 2:])
+    usual = np.maximum(np.maximum(own, wide), 0.1 * _deviation(sums[:, -1:]))
+    scale = np.where(beside > _LOUDER * usual, beside, usual)
     edges = np.concatenate([[0.0], histogram_edge(np.arange(1, HISTOGRAM))])
     first = np.searchsorted(edges, sigma * scale)  # the first bin that lies wholly above
     above = np.concatenate([np.cumsum(histogram[..., ::-1], axis=-1, dtype=np.int64)[..., ::-1], np.zeros((*scale.shape, 1), np.int64)], -1)
