@@ -10,8 +10,10 @@ import pytest
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.effects.candidates import effect_candidates
 from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.instants import tried_instants
 from gyrostab.diagnose.effects.search import gains
 from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.physics.prediction import Windows
 from tests.named import COEFFICIENT, record
 
 _BACK = 1913.0  # s, between two values of the thinned grid
@@ -34,19 +36,36 @@ def test_a_restart_weighs_as_much_as_all_other_times(restarted):
     known = np.array([one.values["at"] == _BACK for one in variants])
     assert known.sum() == 1
     assert weight[known].sum() == pytest.approx(weight[~known].sum())
-    assert weight[~known].sum() == (~known).sum()
+    assert weight[~known].sum() == pytest.approx((~known).sum())
 
 
-def test_without_restarts_all_times_weigh_the_same():
-    assert {one.weight for one in _jumps(record([])).variants} == {1.0}
+def test_each_time_weighs_as_much_as_the_time_that_it_stands_for():
+    variants = sorted(_jumps(record([])).variants, key=lambda one: one.values["at"])
+    at, weight = (np.array(several) for several in zip(*((one.values["at"], one.weight) for one in variants), strict=True))
+    np.testing.assert_allclose(weight[1:-1] / weight[1], (at[2:] - at[:-2]) / (at[2] - at[0]), rtol=1e-9)
+    assert weight.mean() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("at", [1_337.0, 1_350.0, 1_359.0])
+def test_a_large_jump_is_found_at_any_time_of_a_long_record(at):
+    blocks = 2_000
+    windows = 20.0 * np.arange(blocks)
+    means = np.random.default_rng(2).standard_normal(blocks) + 30.0 * np.clip((windows + 20.0 - at) / 20.0, 0.0, 1.0)
+    frame = Windows(windows, windows + 20.0, np.ones(1), 10.0, ("x",), own={"x": means})
+    possible = np.unique(np.concatenate([windows[1:], windows + 10.0]))
+    tried = np.array(tried_instants(possible, frame))
+    assert tried.size < 350
+    assert np.abs(tried - at).min() <= 5.0
 
 
 def test_two_restarts_share_their_weight(restarted):
     twice = restarted.drop_vars(["restart_begin", "restart_end"])
     twice = twice.assign(restart_begin=("restart", [900.0, _BACK]), restart_end=("restart", [905.0, _BACK + 7.0]))
-    weight = np.array([one.weight for one in _jumps(twice).variants])
-    assert np.count_nonzero(weight != 1.0) == 2
-    assert weight[weight != 1.0].sum() == pytest.approx(weight[weight == 1.0].sum())
+    variants = _jumps(twice).variants
+    weight = np.array([one.weight for one in variants])
+    known = np.array([one.values["at"] in (905.0, _BACK + 7.0) for one in variants])
+    assert known.sum() == 2
+    assert weight[known].sum() == pytest.approx(weight[~known].sum())
 
 
 def test_a_jump_where_power_came_back_needs_less_to_be_seen(restarted):

@@ -143,9 +143,9 @@ class BiasJump(Effect):
         return known + step_means(*_go(process, chunk.first + chunk.size, jump), chunk.first, chunk.size), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Times of the jump: where power came back, and the edges of the windows."""
+        """Times of the jump: where power came back, and the edges and the middles of the windows."""
         known = windows.restarts[:, 1] if windows.restarts.size else np.empty(0)
-        return {"at": np.unique(np.concatenate([known, windows.begin[1:]]))}
+        return {"at": np.unique(np.concatenate([known, windows.begin[1:], (windows.begin + windows.end) / 2.0]))}
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means: the share of every window after the jump. The sizes of random jumps are found as `step`, one after the other."""

@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.designs import BUILDERS, Candidate, Variant, term_density
+from gyrostab.diagnose.effects.instants import known_instants, tried_instants
 from gyrostab.diagnose.gains.tallies import OF_LATTICE, coarse_lattice
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.errors import OptionError
@@ -242,7 +243,8 @@ def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
     """Values of the nuisance parameters, and of the words."""
     try:
         grid: dict[str, Sequence[Any]] = {
-            name: _thinned(values, _known_instants(name, windows)) for name, values in kind.example().nuisance(windows).items()
+            name: tried_instants(values, windows) if name == _INSTANT else _thinned(values, _MOST_VALUES)
+            for name, values in kind.example().nuisance(windows).items()
         }
     except KeyError:
         grid = {}
@@ -252,29 +254,34 @@ def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
         yield from (dict(point) for point in known)
         return
     points = list(product(*grid.values()))
-    for point in points[:: max(1, -(-len(points) // _MOST_VARIANTS))]:
+    most = max(_MOST_VARIANTS, len(grid.get(_INSTANT, ())))
+    for point in points[:: max(1, -(-len(points) // most))]:
         yield {name: value if isinstance(value, str) else float(value) for name, value in zip(grid, point, strict=True)}
 
 
-def _thinned(values: Array, known: Array) -> list[Any]:
-    """Some of the values, and those that are known beforehand."""
-    every = max(1, -(-len(values) // _MOST_VALUES))
-    kept = values[every // 2 :: every]
-    return list(kept) if every == 1 or not known.size else list(np.unique(np.concatenate([kept, known])))
-
-
-def _known_instants(name: str, windows: Windows) -> Array:
-    """Instants at which something happened to the instrument, where a nuisance parameter is the instant of something."""
-    return windows.restarts[:, 1] if name == _INSTANT else np.empty(0)
+def _thinned(values: Array, most: int) -> list[Any]:
+    """So many of the values at most."""
+    every = max(1, -(-len(values) // most))
+    return list(values[every // 2 :: every])
 
 
 def _weighed(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
-    """Variants with the chance that something happens when power comes back: as likely as at all other times together."""
-    known = [_INSTANT in one.values and bool(np.isclose(windows.restarts[:, 1], one.values[_INSTANT]).any()) for one in variants]
-    if not any(known) or all(known):
+    """Variants with the chance of the instant at which something happens.
+
+    It is as likely when power comes back as at all other times together, and at these as likely as the time that each stands for is long.
+    """
+    if not variants or not all(_INSTANT in one.values for one in variants):
         return variants
-    share = known.count(False) / known.count(True)
-    return tuple(replace(one, weight=share) if at else one for one, at in zip(variants, known, strict=True))
+    at = np.array([one.values[_INSTANT] for one in variants])
+    known = np.array([bool(np.isclose(known_instants(windows), instant).any()) for instant in at])
+    others, place = np.unique(at[~known], return_inverse=True)
+    if others.size < 2:
+        return variants
+    weight = np.ones(at.size)
+    span = np.gradient(others)[place]
+    weight[~known] = span / span.mean()
+    weight[known] = weight[~known].sum() / max(int(known.sum()), 1)
+    return tuple(replace(one, weight=float(share)) for one, share in zip(variants, weight, strict=True))
 
 
 def _exogenous(effect: Effect, windows: Windows) -> Prediction:
