@@ -8,13 +8,16 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.conclusion.sentences import mismatch_statement
 from gyrostab.diagnose.locating.boxes import merged
 from gyrostab.diagnose.locating.ensemble import _leaked
 from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import null_scores, standardise
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views import gliding, restless, spectrum
 from gyrostab.kernels.periodogram import taper
+from gyrostab.log import make_log
 from tests.reduced_records import baseline, chunks, records
 
 SMALL = {"rate": 10.0, "blocks": 120}
@@ -244,3 +247,12 @@ def test_drawn_lines_leak_as_those_of_tapered_noise_do():
     assert drawn.min() > 0.0
     assert drawn.mean() == pytest.approx(1.0, abs=1e-3)
     assert drawn.var() == pytest.approx(1.0 / 12.0, rel=0.02)
+
+
+def test_a_stretch_that_ends_within_a_block_leaves_nothing_restless():
+    noise = np.random.default_rng(5).standard_normal((2, 12_000))
+    noise[:, 4_000:8_040] *= 6.0
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="100samples")
+    base = calibrate(reduced, quiet=np.arange(120) < 40)
+    told = restless.levelled(reduced, base, [(("x", "y"), 400.0, 810.0)])
+    assert float(np.nanmax(restless.score(told, base)["z"].values)) < 4.8

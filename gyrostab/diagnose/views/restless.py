@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 import xarray as xr
@@ -84,6 +85,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 def levelled(reduced: xr.Dataset, baseline: xr.Dataset, spans: Sequence[tuple[Sequence[str], float, float]]) -> xr.Dataset:
     """The recording with the powers of some stretches brought to the expected mean: their levels are told already.
 
+    The first and the last two blocks of a stretch are so each by itself, for the level may have changed within them.
+
     Parameters
     ----------
     reduced, baseline : xarray.Dataset
@@ -96,8 +99,10 @@ def levelled(reduced: xr.Dataset, baseline: xr.Dataset, spans: Sequence[tuple[Se
     power, spectrum = (one.transpose("axis", "block", "band").values for one in (reduced["power"], baseline["spectrum"]))
     shape, power = reduced["shape"].transpose("axis", "block", "band").values, power.copy()
     for axes, begin, end in spans:
-        blocks = (reduced["begin"].values >= begin - 1e-6) & (reduced["end"].values <= end + 1e-6)
-        for row in np.flatnonzero(np.isin(reduced["axis"].values.astype(str), list(axes))):
+        inside = np.flatnonzero((reduced["begin"].values >= begin - 1e-6) & (reduced["end"].values <= end + 1e-6))
+        pieces = np.split(inside, [1, 2, -2, -1] if inside.size > 4 else range(1, inside.size))
+        rows = np.flatnonzero(np.isin(reduced["axis"].values.astype(str), list(axes)))
+        for row, blocks in product(rows, pieces):
             ratio, weight = power[row, blocks] / spectrum[row, blocks], np.nan_to_num(shape[row, blocks])
             weight = np.where(np.isfinite(ratio), weight, 0.0)
             with np.errstate(invalid="ignore", divide="ignore"):
