@@ -250,9 +250,9 @@ def test_drawn_lines_leak_as_those_of_tapered_noise_do():
 
 
 def test_a_stretch_that_ends_within_a_block_leaves_nothing_restless():
-    noise = np.random.default_rng(5).standard_normal((2, 12_000))
-    noise[:, 4_000:8_040] *= 6.0
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="100samples")
-    base = calibrate(reduced, quiet=np.arange(120) < 40)
-    told = restless.levelled(reduced, base, [(("x", "y"), 400.0, 810.0)])
+    noise = np.random.default_rng(5).standard_normal((2, 60_000))
+    noise[:, 20_000:40_400] *= 6.0
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples")
+    base = calibrate(reduced, quiet=np.arange(60) < 20)
+    told = restless.levelled(reduced, base, [(("x", "y"), 2_000.0, 4_100.0)])
     assert float(np.nanmax(restless.score(told, base)["z"].values)) < 4.8
