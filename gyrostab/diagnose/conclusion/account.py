@@ -173,10 +173,7 @@ def _reach(claim: Claim, reduced: xr.Dataset) -> list[tuple[float, float]]:
 
 
 def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
-    """Whether an effect acts in a good part of a mismatch, or the other way round; noise goes up and down by what ends within it, too."""
     shared = min(box["end"], span[1]) - max(box["begin"], span[0])
-    if str(box["what"]).startswith("restless"):
-        return bool(shared > 0.0)
     return bool(shared >= _MEETS * min(box["end"] - box["begin"], span[1] - span[0]))
 
 
