@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -30,13 +31,41 @@ PARTS = 5
 
 
 @pytest.fixture(scope="module")
-def address():
-    """A scheduler and two workers of one thread each, as a user starts them."""
+def address(tmp_path_factory):
+    """A scheduler and two workers of one thread each, as a user starts them: programs of their own, which may be ended at any moment."""
+    folder = tmp_path_factory.mktemp("cluster")
+    where = folder / "scheduler.json"
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", memory_limit=0, env=environment, silence_logs=50
-    ) as cluster:
-        yield cluster.scheduler_address
+    scheduler = "scheduler --host 127.0.0.1 --port 0".split()
+    worker = "worker --host 127.0.0.1 --nworkers 2 --nthreads 1 --memory-limit 0".split()
+    with ExitStack() as stack:
+        for command in (scheduler, [*worker, "--local-directory", str(folder)]):
+            stack.enter_context(_program("dask", *command, "--scheduler-file", str(where), "--no-dashboard", env=environment))
+        _wait_for(where)
+        with distributed.Client(scheduler_file=str(where)) as client:
+            client.wait_for_workers(2, timeout=60)
+            found = client.scheduler.address
+        yield found
+
+
+@contextmanager
+def _program(module: str, *arguments: str, env: dict[str, str]) -> Iterator[None]:
+    """A program that runs beside the tests, and ends with all that it has started."""
+    command = [sys.executable, "-m", module, *arguments]
+    started = subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        yield
+    finally:
+        os.killpg(started.pid, signal.SIGKILL)
+        started.wait()
+
+
+def _wait_for(path: Path) -> None:
+    for _ in range(600):
+        if path.exists() and path.stat().st_size:
+            return
+        time.sleep(0.1)
+    pytest.fail(f"{path.name} does not appear: the scheduler has not started")
 
 
 @pytest.fixture(autouse=True)
