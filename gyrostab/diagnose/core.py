@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ from gyrostab.diagnose.conclusion.content import (
 from gyrostab.diagnose.conclusion.evidence import held_out
 from gyrostab.diagnose.conclusion.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
 from gyrostab.diagnose.conclusion.surfaces import make_surfaces
-from gyrostab.diagnose.effects.explained import odd_blocks
+from gyrostab.diagnose.effects.explained import without_odd
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import NullScores, null_scores
@@ -39,6 +39,7 @@ from gyrostab.diagnose.modelling.limits import limits
 from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.modelling.refit import fit_claims
+from gyrostab.diagnose.naming.claims import Claim
 from gyrostab.diagnose.naming.levels import without_levels
 from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
 from gyrostab.diagnose.naming.name import Naming, name_effects
@@ -256,9 +257,15 @@ def _concluded(
         own = recalibrate(told, baseline, first, known)
         return predicted(with_noise(told, own), own, known)
 
-    odd = sum(part.gain for claim in told.claims for part in claim.parts if part.candidate.view == "marks")  # no other number has them
-    held = held_out(_without_odd(reduced, told), baseline, trained if told.claims else baseline, more_gain=odd + hopping)
-    mismatches = mismatch_tables(found, reduced, explanations(found, naming.claims, reduced, after, null, level=level / 2.0))
+    parts = [part for claim in told.claims for part in claim.parts]
+    odd = sum(part.gain for part in parts if part.candidate.view == "marks")  # no other number has them
+    held = held_out(without_odd(reduced, parts), baseline, trained if told.claims else baseline, more_gain=odd + hopping)
+
+    def without(left_out: Sequence[Claim]) -> xr.Dataset:
+        return predicted(naming, noise, left_out=left_out)
+
+    explained = explanations(found, naming.claims, reduced, after, null, level=level / 2.0, without=without)
+    mismatches = mismatch_tables(found, reduced, explained)
     mismatches += claim_tables(naming, reduced, mismatches)
     mismatches += unknown_tables(naming, reduced, mismatches)
     mismatches += motion_tables(naming.claims, reduced, mismatches)
@@ -280,16 +287,6 @@ def _concluded(
     diagnosis = Diagnosis(plain(content), surfaces, model_tables(noise, fitted, given))
     check_diagnosis(diagnosis.content)
     return diagnosis
-
-
-def _without_odd(reduced: xr.Dataset, naming: Naming) -> xr.Dataset:
-    """The record without blocks of odd samples that are named: their counts tell what they gain, their powers have no model."""
-    axes = [str(axis) for axis in reduced["axis"].values]
-    odd = np.zeros((len(axes), reduced.sizes["block"]), np.bool_)
-    for part in (part for claim in naming.claims for part in claim.parts if part.candidate.view == "marks"):
-        odd[axes.index(part.row[0])] |= odd_blocks(part, reduced)
-    there = xr.DataArray(~odd, dims=("axis", "block"))
-    return reduced.assign(mean=reduced["mean"].where(there), power=reduced["power"].where(there)) if odd.any() else reduced
 
 
 def quiet_span(text: str) -> tuple[float | str, float | str]:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.effects.explained import Part, without_turns
-from gyrostab.diagnose.locating.locate import louder
-from gyrostab.diagnose.locating.null_scores import NullScores, standardise
+from gyrostab.diagnose.conclusion.weighing import Scores, left_of, needed, view_scores
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.locating.null_scores import NullScores
 from gyrostab.diagnose.naming.name import Claim
-from gyrostab.diagnose.views import VIEWS
-from gyrostab.diagnose.views.restless import levelled
 
 __all__ = ["acting", "explanations", "spans"]
 
@@ -33,7 +32,6 @@ _SHOWS: dict[str, tuple[str, ...]] = {
     "levels": ("mean", "restart", "davar", "distribution", "cross_axis"),
 }
 _MODELLED = ("mean", "power", "cross", "wander", "levels")  # parts that the baseline with the effects holds
-_LEFT = 0.3  # of a mismatch, that an error of the form may leave
 _ACTS = 0.1  # of its largest, that a contribution counts as there
 _STILL, _RESTS = 0.05, 0.05  # of the largest, that is as good as nothing, and share of the blocks that must be so
 _MEETS = 0.3  # of the shorter of effect and mismatch
@@ -99,12 +97,19 @@ def spans(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[floa
 
 
 def explanations(
-    found: xr.Dataset, claims: Sequence[Claim], reduced: xr.Dataset, after: xr.Dataset, null: NullScores, *, level: float
+    found: xr.Dataset,
+    claims: Sequence[Claim],
+    reduced: xr.Dataset,
+    after: xr.Dataset,
+    null: NullScores,
+    *,
+    level: float,
+    without: Callable[[Sequence[Claim]], xr.Dataset] | None = None,
 ) -> list[list[str]]:
     """Effects that explain each mismatch.
 
     An effect explains it when it acts on one of its axes at its time and can show in its view; and where the baseline with the effects
-    holds what it does there, when the mismatch is gone with that baseline, or nearly so.
+    holds what it does there, when the mismatch is gone with that baseline, or nearly so, and takes this effect for it.
 
     Parameters
     ----------
@@ -117,6 +122,9 @@ def explanations(
         What was found is measured by.
     level : float
         False-alarm level.
+    without : callable, optional
+        Gives the baseline with the effects but for some of them, at the sizes that they have beside these. Without it every effect that
+        is in the place of a mismatch is said to explain it.
 
     Returns
     -------
@@ -124,19 +132,30 @@ def explanations(
         Names, for each mismatch.
     """
     boxes = [{str(name): found[name].values[number] for name in found.data_vars} for number in range(found.sizes["mismatch"])]
-    scores = _scores(reduced, after, null, boxes)
+    scores = view_scores(reduced, after, null, boxes, claims)
+    known: dict[tuple[int, ...], Scores] = {(): scores}
+
+    def left(box: Mapping[str, Any], out: Sequence[Claim]) -> tuple[float, float]:
+        chosen = tuple(number for number, claim in enumerate(claims) if any(claim is one for one in out))
+        if chosen not in known and without is not None:
+            rest = [claim for number, claim in enumerate(claims) if number not in chosen]
+            known[chosen] = view_scores(reduced, without(out), null, boxes, rest)
+        return left_of(box, known[chosen], null, level)
+
     when = [_reach(claim, reduced) for claim in claims]
-    out = []
+    told = []
     for box in boxes:
-        gone = _gone(box, scores, null, level)
-        names = []
+        score, limit = left_of(box, scores, null, level)
+        shown = []
         for claim, its_time in zip(claims, when, strict=True):
-            views = {part.candidate.view for part in claim.parts if _can_show(part, box, reduced)}
+            parts = [part for part in claim.parts if _can_show(part, box, reduced)]
             near = any(_meet(box, span) for span in its_time) and set(str(box["axes"]).split()) & set(claim.axes)
-            if views and near and (gone or not views <= _modelled(claim, box)):
-                names.append(claim.effect)
-        out.append(list(dict.fromkeys(names)))
-    return out
+            if parts and near and (score < limit or not {part.candidate.view for part in parts} <= _modelled(claim, box)):
+                shown.append((claim, parts))
+        several = without is not None and score < limit
+        kept = needed(box, shown, partial(left, box)) if several else [claim for claim, _ in shown]
+        told.append(list(dict.fromkeys(claim.effect for claim in kept)))
+    return told
 
 
 def _modelled(claim: Claim, box: Mapping[str, Any]) -> set[str]:
@@ -175,35 +194,3 @@ def _reach(claim: Claim, reduced: xr.Dataset) -> list[tuple[float, float]]:
 def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
     shared = min(box["end"], span[1]) - max(box["begin"], span[0])
     return bool(shared >= _MEETS * min(box["end"] - box["begin"], span[1] - span[0]))
-
-
-def _scores(
-    reduced: xr.Dataset, after: xr.Dataset, null: NullScores, boxes: Sequence[Mapping[str, Any]]
-) -> list[tuple[str, xr.Dataset, Array]]:
-    """Views of the recording against the baseline with the effects."""
-    out = []
-    turns_left_out = without_turns(reduced, after["spectrum"].transpose("axis", "block", "band").values)
-    special = {"distribution": turns_left_out, "restless": levelled(reduced, after, louder(boxes))}
-    for name, score in VIEWS.items():
-        seen = special.get(name, reduced)
-        scores = score(seen, after) if name in null.views else None
-        if scores is not None:
-            out.append((name, scores, standardise(scores, null.views[name])))
-    return out
-
-
-def _gone(box: Mapping[str, Any], scores: Sequence[tuple[str, xr.Dataset, Array]], null: NullScores, level: float) -> bool:
-    """Whether, where the mismatch was, nothing is left that would be one, or little of it."""
-    left, limit = 0.0, np.inf
-    for name, view, z in scores:
-        if view.attrs["view"] != box["view"] or str(box["what"]) not in view["what"].values:
-            continue
-        rows = [number for number, axes in enumerate(view["axes"].values) if set(str(axes).split()) & set(str(box["axes"]).split())]
-        inside = (view["begin"].values >= box["begin"] - 1e-6) & (view["end"].values <= box["end"] + 1e-6)
-        columns = (view["what"].values == box["what"]) & (view["tau_min_s"].values >= 0.99 * box["tau_min_s"])
-        columns &= view["tau_min_s"].values <= 1.01 * box["tau_max_s"]
-        cells = np.abs(z[np.ix_(rows, inside, columns)])
-        if np.isfinite(cells).any():
-            left = max(left, float(np.nanmax(cells)))
-            limit = min(limit, max(null.critical(name, level), _LEFT * abs(float(box["z"]))))
-    return left < limit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,13 +16,26 @@ from gyrostab.diagnose.gains.gain import noise_columns
 from gyrostab.diagnose.gains.lines import expected_lines, line_skirt
 from gyrostab.physics.phase import fold
 
-__all__ = ["Part", "explain_away", "mean_columns", "mirrored", "odd_blocks", "reweighted", "take_part", "without_turns"]
+__all__ = [
+    "FLOOR",
+    "Part",
+    "explain_away",
+    "mean_columns",
+    "mirrored",
+    "odd_blocks",
+    "power_shares",
+    "reweighted",
+    "take_part",
+    "without_odd",
+    "without_turns",
+]
 
 Array = NDArray[np.float64]
+#: Of the expected power, below which no fit goes.
+FLOOR = 0.2
 _LINE_REACH = 3  # lines on each side of one that belong to it
 _FEW = 0.5  # of the blocks at most may be masked
 _TURN = 0.2  # change of the logarithm of the noise power from block to block
-_FLOOR = 0.2  # of the expected power, below which no fit goes
 
 
 @dataclass(frozen=True)
@@ -255,6 +269,16 @@ def odd_blocks(part: Part, reduced: xr.Dataset) -> NDArray[np.bool_]:
     return np.asarray(odd & (odd.mean() <= _FEW))
 
 
+def without_odd(reduced: xr.Dataset, parts: Iterable[Part]) -> xr.Dataset:
+    """The record without the blocks of odd samples that are named: their counts tell what they gain, their powers have no model."""
+    axes = [str(axis) for axis in reduced["axis"].values]
+    odd = np.zeros((len(axes), reduced.sizes["block"]), np.bool_)
+    for part in (part for part in parts if part.candidate.view == "marks"):
+        odd[axes.index(part.row[0])] |= odd_blocks(part, reduced)
+    there = xr.DataArray(~odd, dims=("axis", "block"))
+    return reduced.assign(mean=reduced["mean"].where(there), power=reduced["power"].where(there)) if odd.any() else reduced
+
+
 _TAKERS = {
     "mean": _mean,
     "power": _power,
@@ -274,8 +298,18 @@ def reweighted(state: State, *, rounds: int = 4) -> State:
     for row, axis in enumerate(state.axes):
         named = state.given.get(("power", axis))
         if named:
-            weight[row] = _fit(state, row, axis, np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1), rounds)
+            weight[row] = _fit(state, row, axis, np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1), rounds)[0]
     return replace(state, weight=weight, reduced=without_turns(state.reduced, weight))
+
+
+def power_shares(state: State, axis: str, *, rounds: int = 4) -> Array:
+    """What each column given to the powers of an axis adds to them in the fit of all, (column, block, band)."""
+    row, shape = state.axes.index(axis), state.weight.shape[1:]
+    named = [np.broadcast_to(one, shape) for one in state.given.get(("power", axis), [])]
+    if not named:
+        return np.empty((0, *shape))
+    sizes = _fit(state, row, axis, np.stack(named, axis=-1), rounds)[1]
+    return np.stack([size * one for size, one in zip(sizes, named, strict=True)])
 
 
 def without_turns(reduced: xr.Dataset, expected: Array) -> xr.Dataset:
@@ -304,7 +338,8 @@ def without_turns(reduced: xr.Dataset, expected: Array) -> xr.Dataset:
     )
 
 
-def _fit(state: State, row: int, axis: str, named: Array, rounds: int) -> Array:
+def _fit(state: State, row: int, axis: str, named: Array, rounds: int) -> tuple[Array, Array]:
+    """Fitted powers of an axis, and the sizes of the named columns."""
     expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
     level, precision = noise_columns(state.baseline, axis=axis)
     columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(expected.size, -1)
@@ -315,12 +350,13 @@ def _fit(state: State, row: int, axis: str, named: Array, rounds: int) -> Array:
     power = state.reduced["power"].values[row].ravel()
     shape = state.reduced["shape"].values[row].ravel()
     good = np.isfinite(power) & np.isfinite(shape) & ~np.repeat(state.masked[row], expected.shape[1])
-    fitted = expected.ravel().copy()
+    fitted, sizes = expected.ravel().copy(), np.zeros(size.size)
     for _ in range(rounds):
         w = np.where(good, shape / fitted**2, 0.0)
         w = np.where(np.isfinite(w), w, 0.0)
         normal = (columns * w[:, None]).T @ columns + np.diag(prior)
         normal += 1e-9 * np.diag(np.maximum(np.diagonal(normal), 1e-300))
         moved = columns.T @ (w * np.where(good, power - expected.ravel(), 0.0))
-        fitted = np.maximum(expected.ravel() + columns @ np.linalg.solve(normal, moved), _FLOOR * expected.ravel())
-    return np.asarray(fitted.reshape(expected.shape))
+        sizes = np.linalg.solve(normal, moved)
+        fitted = np.maximum(expected.ravel() + columns @ sizes, FLOOR * expected.ravel())
+    return np.asarray(fitted.reshape(expected.shape)), (sizes / size)[level.shape[2] :]

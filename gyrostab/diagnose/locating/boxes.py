@@ -9,7 +9,7 @@ __all__ = ["merged", "wandering"]
 
 Box = dict[str, Any]
 _LIKE = 0.5  # share of the time of both that two boxes have in common when they are one
-_NEAR = 0.25  # of the longer of two boxes, which may lie between them when they are one
+_NEAR = 0.25  # of the longer of two boxes, which may lie between them when they are one, if it is no longer than the shorter
 _LINE = 0.02  # share of the frequency by which one line may wander
 _KINDS = ("slow", "restless", "glide")
 _STEPS = 3  # boxes of one mean, beyond which it is said to wander
@@ -72,8 +72,8 @@ def _touching(one: Box, other: Box) -> bool:
     """Pieces of the same axes that lie side by side."""
     if not set(one["axes"].split()) <= set(other["axes"].split()) or one["view"] in ("mean", "restart"):
         return False
-    longer = max(one["end"] - one["begin"], other["end"] - other["begin"])
-    return bool(max(one["begin"], other["begin"]) - min(one["end"], other["end"]) <= _NEAR * longer)
+    shorter, longer = sorted([one["end"] - one["begin"], other["end"] - other["begin"]])
+    return bool(max(one["begin"], other["begin"]) - min(one["end"], other["end"]) <= min(_NEAR * longer, shorter) + 1e-6)
 
 
 def _join(box: Box, other: Box) -> None:

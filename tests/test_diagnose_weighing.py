@@ -1,0 +1,147 @@
+"""Which of the effects in the place of a mismatch it takes to explain it: by what is left when one is taken out."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gyrostab.diagnose.conclusion.account import explanations
+from gyrostab.diagnose.conclusion.weighing import needed
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.explained import Part, explain_away, odd_blocks
+from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.locating.boxes import merged
+from gyrostab.diagnose.locating.locate import locate
+from gyrostab.diagnose.locating.null_scores import null_scores
+from gyrostab.diagnose.modelling.predict import predicted
+from gyrostab.diagnose.naming.claims import Claim, Naming
+from tests.named import COEFFICIENT, nulls, record
+
+NAMES = (("vibration_noise", "power", "white"), ("vibration_rectification", "mean", "sensitivity"), ("spikes", "marks", "outliers"))
+
+
+def _claim(candidates, effect, view, column):
+    one = next(one for one in candidates if (one.effect, one.view) == (effect, view))
+    variant = next(one for one in one.variants if one.columns == (column,) and one.values.get("exponent", 1.0) == 1.0)
+    return Claim(effect, one.driver, ("x",), (Part(one, variant, ("x",), 50.0),), 50.0, 8.0)
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    """Vibration that raises noise and bias of x, with the spikes of a few blocks in it; three claims; and what null records do."""
+    reduced = record([])
+    g = reduced["channel_vibration"].values
+    baseline, chance = nulls(reduced, 60)
+    level = np.zeros((3, g.size))
+    level[0] = 0.05 * g**2
+    spiky = np.zeros((3, g.size), np.int64)
+    spiky[0, np.flatnonzero(g > 1.0)[[4, 9]]] = 9
+    changed = reduced.assign(
+        power=reduced["power"] * (1.0 + level[..., None] + 20.0 * (spiky > 0)[..., None]),
+        mean=reduced["mean"] + np.stack([0.004 * g**2, 0 * g, 0 * g]),
+        outliers=(("axis", "block"), spiky),
+    )
+    candidates, reasons = effect_candidates(changed, COEFFICIENT)
+    claims = tuple(_claim(candidates, *names) for names in NAMES)
+    state = begin_state(changed, baseline)
+    for claim in claims[::-1]:  # odd samples are named first
+        state = explain_away(state, list(claim.parts))
+    naming = Naming(claims, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed))
+    return changed, baseline, naming, null_scores(baseline, chance)
+
+
+def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(shaken):
+    reduced, baseline, naming, _ = shaken
+    loud, bias, _ = naming.claims
+    whole, silent, level = (predicted(naming, baseline, left_out=out) for out in ([], [loud], [bias]))
+    quiet = reduced["channel_vibration"].values < 1.0
+    np.testing.assert_allclose(silent["known_mean"], whole["known_mean"])
+    np.testing.assert_allclose(level["spectrum"], whole["spectrum"])
+    np.testing.assert_allclose(level["known_mean"], baseline["known_mean"].transpose("axis", "block"))
+    np.testing.assert_allclose(silent["spectrum"][0][quiet], whole["spectrum"][0][quiet], rtol=0.02)
+    ratio = (whole["spectrum"] / silent["spectrum"]).values[0, ~quiet, -1]
+    np.testing.assert_allclose(ratio, 1.0 + 0.05 * reduced["channel_vibration"].values[~quiet] ** 2, rtol=0.15)
+    np.testing.assert_allclose((silent["spectrum"] / baseline["spectrum"])[0], 1.0, atol=0.2)
+
+
+def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
+    reduced, baseline, naming, null = shaken
+    found = locate(reduced, baseline, null)
+    after = predicted(naming, baseline)
+
+    def told(view, **options):
+        lists = explanations(found, naming.claims, reduced, after, null, level=0.005, **options)
+        return {frozenset(names) for box, names in zip(found["view"].values, lists, strict=True) if box == view}
+
+    def without(out):
+        return predicted(naming, baseline, left_out=out)
+
+    assert {"vibration_noise", "vibration_rectification", "spikes"} in told("davar")
+    noise = told("davar", without=without)
+    assert noise
+    assert set().union(*noise) == {"vibration_noise", "spikes"}
+    assert told("mean", without=without) == {frozenset({"vibration_rectification"})}
+
+
+def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
+    reduced, baseline, naming, null = shaken
+    loud, _, spikes = naming.claims
+    assert odd_blocks(spikes.parts[0], reduced).sum() == 2
+    found = locate(reduced, baseline, null)
+    after = predicted(naming, baseline)
+    one = explanations(found, [loud], reduced, after, null, level=0.005)  # the loudest two blocks are still there
+    both = explanations(found, naming.claims, reduced, after, null, level=0.005)
+    davar = found["view"].values.tolist().index("davar")
+    assert (one[davar], "vibration_noise" in both[davar]) == ([], True)
+
+
+BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
+
+
+def _shown(*views):
+    variant = SimpleNamespace(columns=("white",))
+    return [(f"effect {n}", [SimpleNamespace(candidate=SimpleNamespace(view=view), variant=variant)]) for n, view in enumerate(views)]
+
+
+def _brought(**sizes):
+    """What is left, of scores that add, beside 1; a mismatch from 6 on."""
+
+    def left(out):
+        return 1.0 + sum(sizes[one.replace(" ", "_")] for one in out), 6.0
+
+    return left
+
+
+@pytest.mark.parametrize(
+    ("sizes", "kept"),
+    [
+        ((18.0, 0.4), [0]),  # the second is not missed
+        ((12.0, 6.0), [0, 1]),  # without any of the two it is a mismatch
+        ((4.0, 3.5), [0, 1]),  # without none alone, and both do alike
+        ((4.5, 1.0), [0]),
+        ((0.0, 0.0), [0]),  # one of them does it for the two
+    ],
+)
+def test_an_effect_is_needed_without_which_it_is_a_mismatch_or_that_brings_a_fair_share(sizes, kept):
+    shown = _shown("power", "mean")
+    found = needed(BOX, shown, _brought(effect_0=sizes[0], effect_1=sizes[1]))
+    assert found == [f"effect {number}" for number in kept]
+
+
+def test_what_a_view_does_not_hold_stays():
+    assert needed(BOX | {"view": "spectrum"}, _shown("power", "line"), _brought(effect_0=0.0, effect_1=0.0)) == ["effect 0", "effect 1"]
+    assert needed(BOX, _shown("power", "wander"), _brought(effect_0=9.0, effect_1=0.0)) == ["effect 0", "effect 1"]
+    low_pass = _shown("power", "power")
+    low_pass[1][1][0].variant = SimpleNamespace(columns=())
+    assert needed(BOX, low_pass, _brought(effect_0=9.0, effect_1=0.0)) == ["effect 0", "effect 1"]
+
+
+@pytest.mark.parametrize(("begin", "boxes"), [(70.0, 2), (85.0, 1)])
+def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near(begin, boxes):
+    long = {"view": "davar", "axes": "x y", "what": "level", "begin": 100.0, "end": 400.0, "tau_min_s": 0.01, "tau_max_s": 2.0}
+    long |= {"frequency": float("nan"), "sign": 1, "z": 90.0, "p_value": 1e-9}
+    short = long | {"axes": "x", "begin": begin, "end": begin + 10.0, "z": 80.0}
+    assert len(merged([long, short])) == boxes
