@@ -15,6 +15,8 @@ from gyrostab.units import INNER
 __all__ = ["Shupe", "TemperatureBias", "ThermalGradient", "ThermalHysteresis"]
 
 _MINUTE = 60.0
+_AT_ONCE = 1e-3  # s: a lag that is none
+_TWO_SIDED = 1.96
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,8 +157,8 @@ class Shupe(Effect):
         return _MINUTE * (self.sensitivity * felt[0] + self.transient * felt[1]), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Lags from simple sensors to thick windings, beside sensors on the winding and off it."""
-        return {"lag": np.geomspace(30.0, 3000.0, 6), "sensor_lag": np.array([0.0, 20.0, 60.0])}
+        """Lags from none over simple sensors to thick windings, beside sensors on the winding and off it."""
+        return {"lag": np.append(_AT_ONCE, np.geomspace(30.0, 3000.0, 6)), "sensor_lag": np.array([0.0, 20.0, 60.0])}
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means, from the temperature as finely as it is known, joined by straight lines."""
@@ -174,9 +176,16 @@ class Shupe(Effect):
         """Say it in one sentence."""
         terms = [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
         terms += [f"{self.quantity('transient', errors)} while heat goes through the winding"] if self.transient else []
-        size = f"{' and '.join(terms)} with a lag of {self.quantity('lag', errors)}"
+        size = f"{' and '.join(terms)} {_with_lag(self, errors)}"
         size += f", seen by a sensor that is {self.quantity('sensor_lag', errors)} late" if self.sensor_lag else ""
         return f"The bias follows the change of the temperature {self.on_axes()}, by {size}."
+
+
+def _with_lag(effect: Shupe | ThermalGradient, errors: Mapping[str, float] | None) -> str:
+    """The lag in words; one that is none is known to be short."""
+    if effect.lag > _AT_ONCE:
+        return f"with a lag of {effect.quantity('lag', errors)}"
+    return f"with a lag of {_TWO_SIDED * errors['lag']:.2g} s at most" if errors and "lag" in errors else "without a lag"
 
 
 def _felt(windows: Windows, at: Array, values: Array, lag: float) -> Array:
@@ -242,7 +251,7 @@ class ThermalGradient(Effect):
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Lags of the change."""
-        return {"lag": np.geomspace(10.0, 1000.0, 5)}
+        return {"lag": np.append(_AT_ONCE, np.geomspace(10.0, 1000.0, 5))}
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means of the difference and of its change."""
@@ -254,7 +263,7 @@ class ThermalGradient(Effect):
         """Say it in one sentence."""
         terms = [self.quantity("sensitivity", errors)] if self.sensitivity or not self.change else []
         if self.change:
-            terms.append(f"{self.quantity('change', errors)} of its change, with a lag of {self.quantity('lag', errors)}")
+            terms.append(f"{self.quantity('change', errors)} of its change, {_with_lag(self, errors)}")
         return f"The bias follows the difference of {' and '.join(self.channel_names().values())} {self.on_axes()}, by {', '.join(terms)}."
 
 

@@ -11,15 +11,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.effects.candidates import Variant
 from gyrostab.diagnose.effects.cells import State, begin_state, harmonic_sets
 from gyrostab.diagnose.effects.explained import Part, explain_away, mirrored
 from gyrostab.diagnose.effects.response import is_filter
-from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
+from gyrostab.diagnose.effects.sizes import part_mixture
 from gyrostab.diagnose.modelling.levels import level_sizes
+from gyrostab.diagnose.modelling.nuisance import sizes_over
 from gyrostab.diagnose.modelling.shared import shared_sizes
 from gyrostab.diagnose.naming.filters import filter_sizes
-from gyrostab.diagnose.naming.name import AMBIGUOUS, Claim, Naming
+from gyrostab.diagnose.naming.name import Claim, Naming
 from gyrostab.diagnose.naming.odd import line_size, mark_sizes
 from gyrostab.diagnose.naming.plainer import plainer
 from gyrostab.errors import GyrostabError
@@ -164,7 +164,7 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
         sizes = {**_elsewhere(by_view, view, axes, state, naming), **own}
     for name, (mean, sd, *ends) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
-        if math.isfinite(mean):  # a low-pass of infinite bandwidth is none
+        if math.isfinite(mean) and not math.isnan(sd):  # a low-pass of infinite bandwidth is none; an exponent may be told, not measured
             estimates[name] = _estimate(mean, sd, unit, ends=ends, positive=_positive(kind, name))
         _put(values, name, mean, axes)
     values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
@@ -252,59 +252,13 @@ def _estimate(mean: float, sd: float, unit: str, *, positive: bool, ends: Sequen
 # ---------------------------------------------------------------------------------------------------------------- sizes
 
 
-def _family(part: Part, naming: Naming) -> list[Variant]:
-    """Variants of the part with the same columns: the nuisance grid."""
-    candidate = next(
-        (one for one in naming.candidates if one.key == part.candidate.key and one.view == part.candidate.view), part.candidate
-    )
-    return [one for one in candidate.variants if one.columns == part.variant.columns and one.squared == part.variant.squared]
-
-
-def _mixture(part: Part, state: State, naming: Naming) -> tuple[Mixture, dict[str, tuple[float, float]]]:
-    """Sizes over the nuisance grid, and the nuisance parameters themselves (mean and standard deviation)."""
-    family = _family(part, naming)
-    several = [part_mixture(part, state, variant) for variant in family]
-    usual = _usual(part, family, [float(np.logaddexp.reduce(one.log_weight)) for one in several])
-    family, several = [family[place] for place in usual], [several[place] for place in usual]
-    merged = Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
-    share = np.exp([np.logaddexp.reduce(one.log_weight) for one in several] - np.logaddexp.reduce(merged.log_weight))
-    nuisance = {}
-    for name in {key for one in family for key, value in one.values.items() if not isinstance(value, str)}:
-        grid = np.array([float(one.values[name]) for one in family])
-        if np.ptp(grid) == 0.0 or not np.isfinite(grid).all():
-            continue
-        mean = float(share @ grid)
-        nuisance[name] = (mean, math.sqrt(max(float(share @ (grid - mean) ** 2), (0.3 * _spacing(grid, mean)) ** 2)))
-    return merged, nuisance
-
-
-def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
-    """Places of the variants with the default of every nuisance parameter that the grid has it of, unless others are clearly better."""
-    known = {item.name: item.default for item in effects()[part.candidate.effect].parameters()}
-    plain = [
-        place
-        for place, one in enumerate(family)
-        if all(value == known[name] for name, value in one.values.items() if any(other.values[name] == known[name] for other in family))
-    ]
-    top = max(evidence)
-    return plain if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS else list(range(len(family)))
-
-
-def _spacing(grid: Array, place: float) -> float:
-    """Distance of the grid's values about a place."""
-    known = np.unique(grid)
-    nearest = int(np.abs(known - place).argmin())
-    return float(np.diff(known[max(nearest - 1, 0) : nearest + 2]).mean())
-
-
 def _linear(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
     """Parameters of means, powers, profiles and transfers; by axis where there are several."""
     out: dict[str, tuple[float, float]] = {}
     for part in parts:
         if part.variant.columns[:1] == ("any",):
             continue
-        mixture, nuisance = _mixture(part, state, naming)
-        mean, covariance = mixture.moments()
+        mean, covariance, nuisance = sizes_over(part, state, naming)
         for number, name in enumerate(part.variant.columns):
             value, sd = float(mean[number]), float(math.sqrt(covariance[number, number]))
             if part.variant.squared:

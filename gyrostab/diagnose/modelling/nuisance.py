@@ -1,0 +1,118 @@
+"""Sizes of an effect over the grid of what else is free in it, and what is told of that: lags, exponents, instants."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.effects.candidates import Variant
+from gyrostab.diagnose.effects.cells import State
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
+from gyrostab.diagnose.naming.claims import Naming
+from gyrostab.diagnose.naming.name import AMBIGUOUS, FORM
+from gyrostab.physics.registry import effects
+
+__all__ = ["sizes_over"]
+
+Array = NDArray[np.float64]
+_AT_ONCE = 1e-2  # s: a lag that is as good as none
+
+
+def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, dict[str, tuple[float, float]]]:
+    """Sizes of a part, averaged over the noise and over what else is free.
+
+    An exponent has its default and a lag is none, unless other values are better by 3 nats and an error of the form. The scatter of the
+    sizes holds all lags that the record allows also where none is told; of an exponent the size is another one, in another unit.
+
+    Parameters
+    ----------
+    part : Part
+    state : State
+        With all else that is named.
+    naming : Naming
+        Its candidates have the grid.
+
+    Returns
+    -------
+    mean : ndarray, shape (column,)
+    covariance : ndarray, shape (column, column)
+        About that mean.
+    nuisance : dict of str to (float, float)
+        Value and standard deviation of the others; NaN for one that is told, but not measured.
+    """
+    family = _family(part, naming)
+    several = [part_mixture(part, state, variant) for variant in family]
+    usual = _usual(part, family, _evidence(several))
+    family, several = [family[place] for place in usual], [several[place] for place in usual]
+    evidence = np.array(_evidence(several))
+    whole = _merged(several)
+    mean, covariance = whole.moments()
+    at_once = _at_once(family)
+    told = [place for place in at_once if evidence[place] > evidence.max() - AMBIGUOUS - FORM * max(part.gain, 0.0)]
+    if told:
+        middle, _ = _merged([several[place] for place in told]).moments()
+        mean, covariance = middle, covariance + np.outer(middle - mean, middle - mean)
+    share = np.exp(evidence - np.logaddexp.reduce(evidence))
+    nuisance = {}
+    for name in {key for one in family for key, value in one.values.items() if not isinstance(value, str)}:
+        grid = np.array([float(one.values[name]) for one in family])
+        if not np.isfinite(grid).all():
+            continue
+        if np.ptp(grid) == 0.0:
+            nuisance[name] = (float(grid[0]), math.nan)
+            continue
+        none = bool(told) and _is_lag(name)
+        middle_of = 0.0 if none else float(share @ grid)
+        spread = math.sqrt(float(share @ (grid - middle_of) ** 2))
+        nuisance[name] = (middle_of, max(spread, 0.3 * _spacing(grid, middle_of)))
+    return mean, covariance, nuisance
+
+
+def _merged(several: Sequence[Mixture]) -> Mixture:
+    return Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
+
+
+def _evidence(several: Sequence[Mixture]) -> list[float]:
+    return [float(np.logaddexp.reduce(one.log_weight)) for one in several]
+
+
+def _family(part: Part, naming: Naming) -> list[Variant]:
+    """Variants of the part with the same columns: the grid."""
+    candidate = next(
+        (one for one in naming.candidates if one.key == part.candidate.key and one.view == part.candidate.view), part.candidate
+    )
+    return [one for one in candidate.variants if one.columns == part.variant.columns and one.squared == part.variant.squared]
+
+
+def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
+    """Places of the variants with the default of every parameter that the grid has it of, but lags, unless others are clearly better."""
+    known = {item.name: item.default for item in effects()[part.candidate.effect].parameters()}
+    tried = {name for name in known if not _is_lag(name) and any(one.values.get(name) == known[name] for one in family)}
+    plain = [place for place, one in enumerate(family) if all(one.values.get(name, known[name]) == known[name] for name in tried)]
+    top = max(evidence)
+    return plain if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS else list(range(len(family)))
+
+
+def _at_once(family: Sequence[Variant]) -> list[int]:
+    """Places of the variants without any lag; none where nothing lags at all."""
+    lags = [_lags(one.values) for one in family]
+    return [place for place, mine in enumerate(lags) if mine and max(mine.values()) <= _AT_ONCE] if any(lags) else []
+
+
+def _lags(values: Mapping[str, float | str]) -> dict[str, float]:
+    return {name: float(value) for name, value in values.items() if _is_lag(name)}
+
+
+def _is_lag(name: str) -> bool:
+    return name == "lag" or name.endswith("_lag")
+
+
+def _spacing(grid: Array, place: float) -> float:
+    """Distance of the grid's values about a place."""
+    known = np.unique(grid)
+    nearest = int(np.abs(known - place).argmin())
+    return float(np.diff(known[max(nearest - 1, 0) : nearest + 2]).mean())
