@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from gyrostab.diagnose.conclusion.account import explanations
 from gyrostab.diagnose.conclusion.weighing import needed
@@ -18,6 +19,7 @@ from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import null_scores
 from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.naming.claims import Claim, Naming
+from gyrostab.diagnose.views import mean
 from tests.named import COEFFICIENT, nulls, record
 
 NAMES = (("vibration_noise", "power", "white"), ("vibration_rectification", "mean", "sensitivity"), ("spikes", "marks", "outliers"))
@@ -96,6 +98,31 @@ def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
     both = explanations(found, naming.claims, reduced, after, null, level=0.005)
     davar = found["view"].values.tolist().index("davar")
     assert (one[davar], "vibration_noise" in both[davar]) == ([], True)
+
+
+@pytest.mark.parametrize(("step", "told"), [(0.3, ["bias_jump"]), (0.0, [])])
+def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
+    """The constant of a record is free, so that the mean before a jump stands out as well as that after it."""
+    _, baseline, _, null = shaken
+    reduced = record([])
+    after_it = reduced["begin"].values >= 1800.0
+    moved = reduced.assign(mean=reduced["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it]))
+    candidates, reasons = effect_candidates(moved, COEFFICIENT)
+    one = next(one for one in candidates if (one.effect, one.view) == ("bias_jump", "mean"))
+    variant = next(variant for variant in one.variants if variant.values["at"] == 1800.0)
+    claim = Claim("bias_jump", one.driver, ("x",), (Part(one, variant, ("x",), 50.0),), 50.0, 8.0)
+    state = explain_away(begin_state(moved, baseline), list(claim.parts))
+    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(moved))
+    fields = {"view": "mean", "axes": "x", "what": "mean", "begin": 1200.0, "end": 1800.0, "tau_min_s": 20.0, "tau_max_s": 600.0}
+    fields |= {"frequency": np.nan, "sign": -1, "z": -8.0}
+    box = xr.Dataset({name: ("mismatch", [value]) for name, value in fields.items()})
+    assert mean.score(moved, baseline)["what"].values.tolist() == ["mean"]
+
+    def explained(**options):
+        return explanations(box, [claim], moved, predicted(naming, baseline), null, level=0.005, **options)[0]
+
+    assert explained() == []  # by its time alone
+    assert explained(without=lambda out: predicted(naming, baseline, left_out=out)) == told
 
 
 BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}

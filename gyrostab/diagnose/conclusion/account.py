@@ -109,7 +109,8 @@ def explanations(
     """Effects that explain each mismatch.
 
     An effect explains it when it acts on one of its axes at its time and can show in its view; and where the baseline with the effects
-    holds what it does there, when the mismatch is gone with that baseline, or nearly so, and takes this effect for it.
+    holds what it does there, when the mismatch is gone with that baseline, or nearly so, and takes this effect for it. A mismatch of the
+    mean may also stand before or after what an effect does, where that is what the mean differs from.
 
     Parameters
     ----------
@@ -149,13 +150,27 @@ def explanations(
         shown = []
         for claim, its_time in zip(claims, when, strict=True):
             parts = [part for part in claim.parts if _can_show(part, box, reduced)]
-            near = any(_meet(box, span) for span in its_time) and set(str(box["axes"]).split()) & set(claim.axes)
-            if parts and near and (score < limit or not {part.candidate.view for part in parts} <= _modelled(claim, box)):
+            if not parts or not set(str(box["axes"]).split()) & set(claim.axes):
+                continue
+            if score >= limit and {part.candidate.view for part in parts} <= _modelled(claim, box):
+                continue
+            if any(_meet(box, span) for span in its_time) or (without is not None and _beside(box, parts, partial(left, box, (claim,)))):
                 shown.append((claim, parts))
         several = without is not None and score < limit
         kept = needed(box, shown, partial(left, box)) if several else [claim for claim, _ in shown]
         told.append(list(dict.fromkeys(claim.effect for claim in kept)))
     return told
+
+
+def _beside(box: Mapping[str, Any], parts: Sequence[Part], left: Callable[[], tuple[float, float]]) -> bool:
+    """Whether a mismatch of the mean is there for what an effect does at other times.
+
+    The constant of a record is free: a mean that is higher in one part is one that is lower in the rest, and either may stand out.
+    """
+    if str(box["view"]) != "mean" or not {part.candidate.view for part in parts} <= {"mean", "levels"}:
+        return False
+    score, limit = left()
+    return score >= limit
 
 
 def _modelled(claim: Claim, box: Mapping[str, Any]) -> set[str]:
