@@ -11,6 +11,7 @@ import xarray as xr
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model
 from gyrostab.diagnose.gains.gain import mean_gains, power_gains
 from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.reduction.outliers import CHANCE
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.simulate import simulate
 
@@ -68,7 +69,7 @@ def test_statistics_are_those_of_raw_logs(lost):
     close(found["kurtosis"], nulls["kurtosis"], rel=0.1)
     close(found["line_power"].max("line"), nulls["line_power"].max("line"), rel=0.15)
     assert set(np.unique(nulls["extremes"].sum("block"))) == {2}
-    assert int(nulls["outliers"].max()) == 0
+    assert 0.0 < float(nulls["outliers"].sum(["axis", "block"]).mean()) < 5.0 * CHANCE * nulls.sizes["axis"]
 
 
 def test_lattices_give_repeats_zeros_and_extremes():

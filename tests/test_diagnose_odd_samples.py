@@ -88,3 +88,28 @@ def test_noise_that_rises_and_falls_has_no_spikes():
         shaken = (np.arange(15_000) >= 31 * 162 + edge) & (np.arange(15_000) < 62 * 162 + edge)
         noise = SCATTER * rng.standard_normal((2, 15_000)) * np.where(shaken, 5.0, 1.0)
         assert int(reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xy")))["outliers"].sum()) <= 1
+
+
+def test_spikes_of_six_deviations_are_named_and_counted():
+    rng = np.random.default_rng(8)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    noise[1, rng.choice(15_000, 20, replace=False)] += 6.0 * SCATTER * rng.choice([-1.0, 1.0], 20)
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(reduced, 40)
+    (claim,) = (found := name_effects(reduced, baseline, records)).claims
+    assert (claim.effect, claim.axes) == ("spikes", ("y",))
+    (fitted,) = fit_claims(found, baseline)
+    number = fitted.parameters["per_hour"].value * 15_000 / 36_000
+    assert 10 < number < 40
+    assert 0.5 < fitted.parameters["size"].value / (6.0 * SCATTER) < 2.0
+
+
+def test_bursts_of_noise_shorter_than_a_block_have_no_spikes():
+    rng = np.random.default_rng(9)
+    loud = np.ones(15_000)
+    for first in rng.integers(0, 14_900, 10):
+        loud[first : first + 40] = 8.0
+    noise = SCATTER * loud * rng.standard_normal((3, 15_000))
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(reduced, 40)
+    assert "spikes" not in [claim.effect for claim in name_effects(reduced, baseline, records).claims]

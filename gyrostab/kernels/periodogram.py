@@ -15,7 +15,6 @@ any gaps, and its variance gives the shape of the gamma distribution that it fol
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -24,12 +23,10 @@ from numpy.typing import NDArray
 from gyrostab.kernels.compiled import INNER, KERNEL
 
 __all__ = [
-    "HISTOGRAM",
     "band_edges",
     "band_powers",
     "block_samples",
     "gap_spectra",
-    "histogram_edge",
     "ordinates",
     "phase_profile",
     "shape_of_bands",
@@ -38,8 +35,6 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-#: Bins of the histogram of second differences: one for zero, then four an octave from 2**-32 to 2**32.
-HISTOGRAM = 256
 _EXACT = 12  # ordinates of a band up to which the covariance of each pair is summed
 
 
@@ -74,20 +69,8 @@ def band_edges(size: int, bands: int = 16) -> NDArray[np.int64]:
     return np.unique(np.round(np.geomspace(1, top, bands + 1)).astype(np.int64))
 
 
-@njit(**INNER)
-def _bin(value):  # type: ignore[no-untyped-def]
-    if value == 0.0:
-        return np.int64(0)
-    return np.int64(min(max(4.0 * math.log2(value) + 128.0, 1.0), 255.0))
-
-
-def histogram_edge(number: Any) -> Array:
-    """Lower edge of bin `number` of the histogram of second differences; fractions of a bin are allowed."""
-    return np.asarray(np.exp2((np.asarray(number, np.float64) - 128.0) / 4.0))
-
-
 @njit(**KERNEL)
-def block_samples(x, centred, moments, counts, histogram):  # type: ignore[no-untyped-def]
+def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
     """What the samples of each block tell, in one pass.
 
     Parameters
@@ -101,8 +84,6 @@ def block_samples(x, centred, moments, counts, histogram):  # type: ignore[no-un
     counts : ndarray of int64, shape (block, 7)
         Is filled with the samples present, exact zeros, samples equal to the one before but for zeros, samples equal to the smallest
         and to the largest value of the block, and how many of these two are equal to the one before and no zeros.
-    histogram : ndarray of uint32, shape (block, `HISTOGRAM`) or (0, 0)
-        Is filled with the number of second differences by size, unless it is empty.
     """
     size = x.shape[1]
     for b in range(x.shape[0]):
@@ -137,11 +118,6 @@ def block_samples(x, centred, moments, counts, histogram):  # type: ignore[no-un
             if i > 0 and value == row[i - 1] and value != 0.0:
                 lows_again += value == low
                 highs_again += value == high
-        if histogram.shape[0] > 0:
-            for i in range(2, size):
-                difference = abs(row[i] - row[i - 1] - row[i - 1] + row[i - 2])
-                if difference == difference:
-                    histogram[b, _bin(difference)] += np.uint32(1)
         counts[b, 0], counts[b, 1], counts[b, 2], counts[b, 3], counts[b, 4] = present, zeros, repeats, lows, highs
         counts[b, 5], counts[b, 6] = lows_again, highs_again
         moments[b, 0], moments[b, 1], moments[b, 2] = mean, second / max(present, 1), fourth / max(present, 1)

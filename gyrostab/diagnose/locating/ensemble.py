@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from gyrostab.diagnose.calibration.expected import line_columns, white_variance
 from gyrostab.diagnose.locating.shared import Shared, shared_by, shared_spectra, shared_white
-from gyrostab.diagnose.reduction.outliers import beyond_chance
+from gyrostab.diagnose.reduction.outliers import CHANCE, beyond_chance
 from gyrostab.kernels.periodogram import taper
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times
 from gyrostab.noise import HOUR
@@ -25,7 +25,6 @@ __all__ = ["null_records"]
 
 Array = NDArray[np.float64]
 _CHUNK = 25
-_TAIL = 1e-9  # probability of a second difference beyond the limit that counts as an outlier
 _POOL = 10**6  # samples made one by one
 _COARSE = 1.5  # standard deviations: a lattice step from which on the values are few levels
 
@@ -344,7 +343,7 @@ def _counts(frame: _Frame, count: int, rng: np.random.Generator) -> dict[str, ND
     together = rng.binomial(zeros, near) if len(samples) == 1 else np.minimum(at_once, zeros)
     filled = beyond_chance(together, zeros, samples)
     return {
-        "outliers": rng.poisson(np.broadcast_to(samples * _TAIL, size)),
+        "outliers": rng.poisson(np.broadcast_to(CHANCE * samples / np.maximum(samples.sum(axis=1, keepdims=True), 1), size)),
         "repeats": rng.binomial(adjacent, np.broadcast_to(repeat, size)),
         "zeros": zeros,
         "stuck": zeros - filled,

@@ -8,13 +8,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.effects.search import Tallies
+from gyrostab.diagnose.reduction.outliers import outlier_limit
 
 __all__ = ["line_size", "mark_sizes"]
 
-_PER_SPIKE = 3.0  # second differences that hold a spike
-_LIMIT = 6.0  # standard deviations beyond which one counts as an outlier
+_DEPARTURE = 1.08  # of white noise from the median of eight samples beside each, in its own deviations
 _USUAL = 0.2  # of the usual variance of a block, by which that of one may be higher by chance
-_LAW = 0.1  # of the number and the size of outliers, by which the law of their sizes may be another
+_LAW = 0.1  # of the number and the size of outliers, by which the law of their sizes may be another; at least half of those not seen
 Pair = tuple[float, float]
 
 
@@ -54,13 +54,16 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
     spread = _spread(reduced, axis)
     error = math.sqrt(count + usual)
     if effect == "spikes":
+        count = max(float(reduced["peaks"].sel(axis=axis).where(reduced[mark].sel(axis=axis) > 0).sum()), 1.0)
+        error = math.sqrt(count)
         told = _outliers(reduced, axis, spread)
         if told is None:  # no block was steady enough to have a kurtosis
-            return {"per_hour": (count / _PER_SPIKE / hours, error / _PER_SPIKE / hours)}
+            return {"per_hour": (count / hours, error / hours)}
         seen, size, many = told
         number = count / seen
-        doubt = math.hypot(1.0 / math.sqrt(2.0 * many), _LAW)
-        return {"per_hour": (number / hours, number / hours * math.hypot(1.0 / math.sqrt(number), _LAW)), "size": (size, doubt * size)}
+        law = max(_LAW, 0.5 * (1.0 - seen))
+        doubt = math.hypot(1.0 / math.sqrt(2.0 * many), law)
+        return {"per_hour": (number / hours, number / hours * math.hypot(1.0 / error, law)), "size": (size, doubt * size)}
     if effect == "held_samples":
         return {"per_hour": (count / hours, error / hours), "length": (1.0 / rate, 0.5 / rate)}
     share = min(count / samples, 0.999)
@@ -75,20 +78,21 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
 
 
 def _outliers(reduced: xr.Dataset, axis: str, spread: float) -> tuple[float, float, float] | None:
-    """Second differences beyond the limit that an outlier makes on average, its rms size, and outliers told by; None where nothing tells.
+    """Share of outliers that is seen, their rms size, and outliers told by; None where nothing tells.
 
     Of a block of n samples of the deviation s with m outliers of the square u s^2 each, a = m u / n, the fourth moment over the squared
-    second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2, which is solved for a. Only the larger ones of a normal law are seen.
+    second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2, which is solved for a. Only the larger ones of a normal law are seen,
+    whose deviation is no less than the least that is: below, the number of those not seen would be anything.
     """
     from scipy.stats import norm
 
-    count, excess, samples = (reduced[name].sel(axis=axis).values.astype(np.float64) for name in ("outliers", "kurtosis", "samples"))
+    count, excess, samples = (reduced[name].sel(axis=axis).values.astype(np.float64) for name in ("peaks", "kurtosis", "samples"))
     good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
-    alone = good & (count <= _PER_SPIKE)  # of several in a block the sizes differ
+    alone = good & (count == 1.0)  # of several in a block the sizes differ
     good = alone if alone.any() else good
     if not good.any():
         return None
-    many = np.maximum(np.round(count[good] / _PER_SPIKE), 1.0)
+    many = count[good]
     most = samples[good] / (many * (1.0 - many / samples[good])) - 3.0  # without noise, the mean of the block taken off
     tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * most)
     half, far = tails - 3.0, most - tails
@@ -96,11 +100,11 @@ def _outliers(reduced: xr.Dataset, axis: str, spread: float) -> tuple[float, flo
     raised = np.maximum(reduced["variance"].sel(axis=axis).values[good] / spread**2 - 1.0, 0.0) + _USUAL
     share = np.where(many > 1.0, np.fmin(share, raised), share)
     square = float((share * samples[good]).sum() / many.sum())
-    limit = _LIMIT * math.sqrt(6.0)
-    ends = np.geomspace(2.0, 1e-4, 400)  # the least size that is seen, over the rms size
-    seen_squares = (0.5 * limit / ends) ** 2 * (1.0 + ends * norm.pdf(ends) / norm.sf(ends))
-    size = 0.5 * limit / float(np.interp(square, seen_squares, ends))
-    return float(2.0 * norm.sf(0.5 * limit / size) + 4.0 * norm.sf(limit / size)), size * spread, float(many.sum())
+    limit = _DEPARTURE * outlier_limit(float(samples.sum()))
+    ends = np.geomspace(1.0, 1e-4, 400)  # the least size that is seen, over the rms size
+    seen_squares = (limit / ends) ** 2 * (1.0 + ends * norm.pdf(ends) / norm.sf(ends))
+    size = limit / float(np.interp(square, seen_squares, ends))
+    return float(2.0 * norm.sf(limit / size)), size * spread, float(many.sum())
 
 
 def _spread(reduced: xr.Dataset, axis: str) -> float:

@@ -10,10 +10,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.reduction.outliers import zeros_together
+from gyrostab.diagnose.reduction.outliers import Peaks, find_peaks, zeros_together
 from gyrostab.diagnose.reduction.stretches import Stretch, channel_at, numeric_channels
 from gyrostab.errors import UnitError
 from gyrostab.kernels import periodogram as kernel
+from gyrostab.kernels.outliers import HISTOGRAM
 from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.timegrid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
@@ -51,7 +52,8 @@ class Accumulator:
         self.moments = np.full((rows, blocks, 5), np.nan)
         self.counts = np.zeros((rows, blocks, 7), np.int64)
         self.together = np.zeros((self.axes, blocks), np.int64)
-        self.histogram = np.zeros((self.axes, blocks, kernel.HISTOGRAM), np.uint32)
+        self.histogram = np.zeros((self.axes, blocks, HISTOGRAM), np.uint32)
+        self.peaks: list[list[Peaks]] = [[] for _ in range(self.axes)]
         self.power = np.full((rows, blocks, bands), np.nan)
         self.shape = np.full((self.axes, blocks, bands), np.nan)
         self.neighbours = np.full((self.axes, blocks), np.nan)
@@ -86,8 +88,10 @@ class Accumulator:
         present = ~np.isnan(stretch.values)
         centred = np.empty_like(stretch.values)
         for row in range(self.rows):
-            histogram = self.histogram[row, part] if row < self.axes else np.empty((0, 0), np.uint32)
-            kernel.block_samples(stretch.values[row], centred[row], self.moments[row, part], self.counts[row, part], histogram)
+            kernel.block_samples(stretch.values[row], centred[row], self.moments[row, part], self.counts[row, part])
+            if row < self.axes:
+                found = find_peaks(stretch.values[row], self.histogram[row, part])
+                self.peaks[row].append(found._replace(block=found.block + stretch.first))
         self._spectra(part, centred, present)
         self.together[:, part] = zeros_together(stretch.values[: self.axes])
         self.adjacent[:, part] = np.count_nonzero(present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1)

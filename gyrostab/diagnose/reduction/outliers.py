@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.periodogram import HISTOGRAM, histogram_edge
+from gyrostab.kernels.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
-__all__ = ["beyond_chance", "count_outliers", "lattice_step", "zeros_together"]
+__all__ = ["CHANCE", "Peaks", "beyond_chance", "count_outliers", "find_peaks", "lattice_step", "outlier_limit", "zeros_together"]
 
 Array = NDArray[np.float64]
-_SIGMA = 6.0
+#: Outliers that a record of Gaussian noise has on average, by axis.
+CHANCE = 0.02
+_LOWEST = 4.0  # deviations of the block's own from which on a sample may be an outlier
+_SWELLS = np.linspace(0.0, 0.6, 61)  # scatter of the logarithm of a level within blocks
+_FAIR = (2.5, 3.7)  # deviations between which departures tell how much the level swells, and outliers hardly count
 _CLEAR = 64.0  # a lattice is as many times coarser than the last digit
 _RARE = 0.01  # of the values, which may stand off a lattice that is coarse
 _TAILS = 0.1  # of the values, where spikes may be as common as those of the lattice
@@ -21,34 +26,79 @@ _LOUDER = 1.5  # times, that a block beside counts as louder
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
 
-def count_outliers(histogram: NDArray[np.uint32], *, sigma: float = _SIGMA) -> NDArray[np.int64]:
-    """Second differences beyond `sigma` robust standard deviations.
+class Peaks(NamedTuple):
+    """Samples that stand alone, far from those about them: `gyrostab.kernels.outliers.peaks` of an axis."""
 
-    The deviation is from the median: the larger of the block's own and of that which it has together with two neighbours on either
-    side, that of the next one where this is louder by half, for the noise may have risen within the block, and at least a tenth of the
-    record's.
+    block: NDArray[np.int64]
+    size: Array
+    level: Array
+
+
+def find_peaks(values: Array, histogram: NDArray[np.uint32]) -> Peaks:
+    """Peaks of some blocks of an axis that may be outliers; the histogram of the departures is added to.
+
+    Parameters
+    ----------
+    values : ndarray, shape (block, sample)
+        NaN where missing.
+    histogram : ndarray, shape (block, `HISTOGRAM`)
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(1).standard_normal((50, 200))
+    >>> x[7, 100] += 30.0
+    >>> found = find_peaks(x, np.zeros((50, HISTOGRAM), np.uint32))
+    >>> int(found.block[found.size.argmax()]), float(found.size.max().round())
+    (7, 29.0)
+    """
+    away = np.empty_like(values)
+    departures(values, away, histogram)
+    return Peaks(*peaks(values, away, _deviation(histogram.astype(np.int64)), _LOWEST))
+
+
+def outlier_limit(samples: float) -> float:
+    """Standard deviations beyond which so many normal numbers have `CHANCE` on average, four at least.
+
+    Examples
+    --------
+    >>> round(outlier_limit(18_000), 2), round(outlier_limit(8_640_000), 2)
+    (4.87, 5.97)
+    """
+    from scipy.special import ndtri
+
+    return float(max(-ndtri(CHANCE / (2.0 * max(samples, 1.0))), _LOWEST))
+
+
+def count_outliers(histogram: NDArray[np.uint32], found: Sequence[Sequence[Peaks]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Samples that jump out, and their count for evidence: one that does by twice the limit has three, since no chance makes it.
+
+    The limit is so many standard deviations of the departures that Gaussian noise as long as the record has `CHANCE` beyond. The
+    deviation is from the median: the larger of the block's own and of that which it has together with two neighbours on either side,
+    that of the next one where this is louder by half, for the noise may have risen within the block, at least a tenth of the record's,
+    and at least what the noise right before or after the sample has. Where departures of 2.5 to 3.7 deviations are more than those of
+    Gaussian noise, the level swells faster than that can follow: the limit is moved out to where a level of a log-normal law with as
+    many of them has `CHANCE` beyond.
 
     Parameters
     ----------
     histogram : ndarray, shape (axis, block, `HISTOGRAM`)
-        Number of second differences by size.
-    sigma : float
-        Limit; it is moved up to the next edge of a bin, by 19 % at most.
+        Number of departures by size.
+    found : sequence of sequence of Peaks
+        Of each axis, with the numbers of the blocks in the record.
 
     Returns
     -------
-    ndarray of int64, shape (axis, block)
+    peaks, outliers : ndarray of int64, shape (axis, block)
 
     Examples
     --------
-    >>> from gyrostab.kernels.periodogram import block_samples
     >>> x = np.random.default_rng(1).standard_normal((50, 200))
     >>> x[7, 100] += 30.0
+    >>> x[9, 100] += 7.0
     >>> histogram = np.zeros((1, 50, HISTOGRAM), np.uint32)
-    >>> block_samples(x, np.empty_like(x), np.empty((50, 5)), np.empty((50, 7), np.int64), histogram[0])
-    >>> counts = count_outliers(histogram)
-    >>> int(counts[0, 7]), int(counts.sum())
-    (3, 3)
+    >>> number, outliers = count_outliers(histogram, [[find_peaks(x, histogram[0])]])
+    >>> number[0, [7, 9]], outliers[0, [7, 9]], int(number.sum())
+    (array([1, 1]), array([3, 1]), 2)
     """
     sums = np.concatenate([np.zeros_like(histogram[:, :1], dtype=np.int64), np.cumsum(histogram, axis=1, dtype=np.int64)], axis=1)
     blocks = np.arange(histogram.shape[1])
@@ -58,10 +108,45 @@ def count_outliers(histogram: NDArray[np.uint32], *, sigma: float = _SIGMA) -> N
     beside = np.maximum(beside[:, :-2], beside[:, 2:])
     usual = np.maximum(np.maximum(own, wide), 0.1 * _deviation(sums[:, -1:]))
     scale = np.where(beside > _LOUDER * usual, beside, usual)
-    edges = np.concatenate([[0.0], histogram_edge(np.arange(1, HISTOGRAM))])
-    first = np.searchsorted(edges, sigma * scale)  # the first bin that lies wholly above
-    above = np.concatenate([np.cumsum(histogram[..., ::-1], axis=-1, dtype=np.int64)[..., ::-1], np.zeros((*scale.shape, 1), np.int64)], -1)
-    return np.asarray(np.where(scale > 0, np.take_along_axis(above, first[..., None], axis=-1)[..., 0], 0))
+    number, outliers = np.zeros((2, *scale.shape), np.int64)
+    for axis, parts in enumerate(found):
+        limit = _swollen_limit(histogram[axis], scale[axis])
+        for one in parts:
+            away = one.size / np.maximum(scale[axis, one.block], one.level)
+            np.add.at(number[axis], one.block, away > limit)
+            np.add.at(outliers[axis], one.block, np.where(away > 2.0 * limit, 3, 1) * (away > limit))
+    return number, outliers
+
+
+def _swollen_limit(histogram: NDArray[np.uint32], scale: Array) -> float:
+    """Limit in deviations for an axis whose level may swell within its blocks."""
+    from scipy.special import ndtr
+
+    total = float(histogram.sum())
+    limit = outlier_limit(total)
+    low, high = _FAIR
+    fair = 2.0 * (ndtr(-low) - ndtr(-high))
+    surplus = _number_between(histogram, scale, low, high) / max(total * fair, 1e-300)
+    place, weight = np.polynomial.hermite_e.hermegauss(31)
+    weight = weight / weight.sum()
+    level = np.exp(_SWELLS[:, None] * place)
+    more = 2.0 * ((ndtr(-low / level) - ndtr(-high / level)) @ weight) / fair
+    level = np.exp(np.interp(surplus, more, _SWELLS) * place)
+    tried = np.geomspace(limit, 3.0 * limit, 200)
+    beyond = np.log(2.0 * (ndtr(-tried[:, None] / level) @ weight))
+    return float(np.interp(-np.log(2.0 * ndtr(-limit)), -beyond, tried))
+
+
+def _number_between(histogram: NDArray[np.uint32], scale: Array, low: float, high: float) -> float:
+    """Departures from `low` to `high` deviations, those of a bin shared out as normal ones."""
+    from scipy.special import ndtr
+
+    edges = np.concatenate([[0.0], histogram_edge(np.arange(1, HISTOGRAM + 1))]) / np.where(scale > 0.0, scale, np.inf)[:, None]
+    tail = ndtr(-edges)
+    inside = ndtr(-np.clip(edges, low, high))
+    whole = tail[:, :-1] - tail[:, 1:]
+    share = np.divide(inside[:, :-1] - inside[:, 1:], whole, out=np.zeros_like(whole), where=whole > 0.0)
+    return float((histogram * share).sum())
 
 
 def _deviation(histogram: NDArray[np.int64]) -> Array:

@@ -106,7 +106,7 @@ def reduce_log(
     -------
     xarray.Dataset
         By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``, ``neighbours``, ``adjacent``,
-        ``kurtosis``, ``outliers``, ``repeats``, ``extremes``, ``zeros``, and of these ``stuck`` and ``filled``. By
+        ``kurtosis``, ``peaks``, ``outliers``, ``repeats``, ``extremes``, ``zeros``, and of these ``stuck`` and ``filled``. By
         ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``,
         ``cross_shape`` (pair, block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
         ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
@@ -161,6 +161,7 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
     enough = present >= max(_MEAN_SHARE * work.length, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
+    peaks, outliers = count_outliers(work.histogram, work.peaks)
     filled = beyond_chance(work.together, counts[..., 1], present)
     lattice = np.array([lattice_step(np.concatenate([kept[row].ravel() for kept in work.kept])) for row in range(work.axes)])
     weight = np.divide(work.line_counts[..., 0] ** 2, work.line_counts[..., 1], where=work.line_counts[..., 1] > 0,
@@ -176,7 +177,8 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
         "shape": (cube, work.shape, _named("shape of the gamma distribution of the power in white noise", "1")),
         "neighbours": (plane, work.neighbours, _named("share of neighbouring pairs of samples, tapered", "1")),
         "kurtosis": (plane, np.where(np.isnan(work.neighbours), np.nan, kurtosis), _named("excess kurtosis of the block", "1")),
-        "outliers": (plane, count_outliers(work.histogram), _named("second differences beyond 6 robust sigma", "1")),
+        "peaks": (plane, peaks, _named("samples that jump out alone", "1")),
+        "outliers": (plane, outliers, _named("samples that jump out alone, three times those beyond twice the limit", "1")),
         "adjacent": (plane, work.adjacent, _named("samples with another one right before them in the block", "1")),
         "repeats": (plane, _repeats(moments, counts), _named("samples equal to the one before, but for zeros and the ends", "1")),
         "extremes": (plane, _extremes(moments, counts), _named("samples equal to the smallest or largest of the record", "1")),

@@ -1,0 +1,226 @@
+"""How far samples stand from those about them, and which stand alone.
+
+The departure of a sample is what it has beyond the median of the four samples on either side, of which only pairs at the same distance
+are taken: so a slope makes none, and a sample that jumps out makes none in its neighbours. At the edges of a block and of gaps, where
+no two pairs are, it is the smaller of what goes beyond the level and beyond the slope of four samples on one side.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import INNER, KERNEL
+
+__all__ = ["HISTOGRAM", "departures", "histogram_edge", "peaks"]
+
+Array = NDArray[np.float64]
+
+#: Bins of the histogram of departures: one for zero, then four an octave from 2**-32 to 2**32.
+HISTOGRAM = 256
+_PAIRS = 4
+#: Variance of the median of 0, 2, 4, 6 and 8 normal numbers.
+_MEDIANS = (0.0, 0.5, 0.2982, 0.2147, 0.1682)
+_ALONE = 0.4  # of the departure, by which a sample is beyond the ones right beside it as well
+_WINDOWS = (8, 16, 64, 256)  # samples before or after that tell how loud the noise is there
+_NEAR = 16  # samples away that others jump out, about which the noise is as loud as about this one
+_MEDIAN = 0.6745  # of the absolute value of a standard normal number
+_ERROR = 1.17  # of the deviation from the median of one number
+
+
+@njit(**INNER)
+def _bin(value):  # type: ignore[no-untyped-def]
+    if value == 0.0:
+        return np.int64(0)
+    return np.int64(min(max(4.0 * math.log2(value) + 128.0, 1.0), 255.0))
+
+
+def histogram_edge(number: Any) -> Array:
+    """Lower edge of bin `number` of the histogram of departures; fractions of a bin are allowed."""
+    return np.asarray(np.exp2((np.asarray(number, np.float64) - 128.0) / 4.0))
+
+
+@njit(**INNER)
+def _sorted_four(a, b, c, d):  # type: ignore[no-untyped-def]
+    a, b = min(a, b), max(a, b)
+    c, d = min(c, d), max(c, d)
+    a, c = min(a, c), max(a, c)
+    b, d = min(b, d), max(b, d)
+    return a, min(b, c), max(b, c), d
+
+
+@njit(**INNER)
+def _median_eight(row, i):  # type: ignore[no-untyped-def]
+    """Median of the four samples on either side, none of them missing."""
+    a, b, c, d = _sorted_four(row[i - 1], row[i - 2], row[i - 3], row[i - 4])
+    e, f, g, h = _sorted_four(row[i + 1], row[i + 2], row[i + 3], row[i + 4])
+    fourth = min(min(d, h), min(max(c, e), min(max(b, f), max(a, g))))
+    fifth = max(max(a, e), max(min(b, h), max(min(c, g), min(d, f))))
+    return 0.5 * (fourth + fifth)
+
+
+@njit(**INNER)
+def _insert(values, count, value):  # type: ignore[no-untyped-def]
+    """Put a value among the first `count`, which are sorted."""
+    at = count
+    while at > 0 and values[at - 1] > value:
+        values[at] = values[at - 1]
+        at -= 1
+    values[at] = value
+
+
+@njit(**INNER)
+def _median_pairs(row, i, near):  # type: ignore[no-untyped-def]
+    """Median of the pairs of samples that are both there, and their number."""
+    count = 0
+    for apart in range(1, _PAIRS + 1):
+        if i - apart < 0 or i + apart >= row.size:
+            break
+        one, other = row[i - apart], row[i + apart]
+        if one != one or other != other:
+            continue
+        _insert(near, count, one)
+        _insert(near, count + 1, other)
+        count += 2
+    if count == 0:
+        return np.nan, 0
+    return 0.5 * (near[count // 2 - 1] + near[count // 2]), count // 2
+
+
+@njit(**INNER)
+def _one_sided(row, i):  # type: ignore[no-untyped-def]
+    """Departure at an edge: the smaller of those from the level and from the slope of the four samples on one side; NaN without these."""
+    for side in (1, -1):
+        if 0 <= i + _PAIRS * side < row.size:
+            one, two = row[i + side], row[i + 2 * side]
+            _, low, high, _ = _sorted_four(one, two, row[i + 3 * side], row[i + 4 * side])
+            level = (row[i] - 0.5 * (low + high)) * math.sqrt((1.0 + _MEDIANS[4]) / (1.0 + _MEDIANS[2]))
+            slope = (row[i] - 2.0 * one + two) * math.sqrt((1.0 + _MEDIANS[4]) / 6.0)
+            both = one + two + row[i + 3 * side] + row[i + 4 * side]
+            if both == both:
+                if level * slope <= 0.0:
+                    return 0.0
+                return level if abs(level) < abs(slope) else slope
+    return np.nan
+
+
+@njit(**KERNEL)
+def departures(x, out, histogram):  # type: ignore[no-untyped-def]
+    """How far each sample stands from those about it, as if there were always eight of them.
+
+    Parameters
+    ----------
+    x : ndarray, shape (block, sample)
+        Values, NaN where missing.
+    out : ndarray, shape (block, sample)
+        Is filled with the departures, NaN where there are none; those from fewer samples are smaller, so that all scatter alike.
+    histogram : ndarray of uint32, shape (block, `HISTOGRAM`)
+        The number of absolute departures by size is added to it.
+    """
+    size = x.shape[1]
+    near = np.empty(2 * _PAIRS)
+    share = np.empty(_PAIRS + 1)
+    for pairs in range(_PAIRS + 1):
+        share[pairs] = math.sqrt((1.0 + _MEDIANS[_PAIRS]) / (1.0 + _MEDIANS[pairs]))
+    for b in range(x.shape[0]):
+        row = x[b]
+        for i in range(size):
+            middle, pairs = np.nan, _PAIRS
+            if _PAIRS <= i < size - _PAIRS:
+                total = row[i - 4] + row[i - 3] + row[i - 2] + row[i - 1] + row[i + 1] + row[i + 2] + row[i + 3] + row[i + 4]
+                if total == total:
+                    middle = _median_eight(row, i)
+            if middle != middle:
+                middle, pairs = _median_pairs(row, i, near)
+            away = _one_sided(row, i) if pairs < 2 else np.nan
+            if away != away:
+                away = (row[i] - middle) * share[pairs]
+            out[b, i] = away
+            if away == away:
+                histogram[b, _bin(abs(away))] += np.uint32(1)
+
+
+@njit(**INNER)
+def _level(away, low, high, room):  # type: ignore[no-untyped-def]
+    """Deviation of the departures from `low` to before `high`, less an error of it; 0 where too few samples tell."""
+    count = 0
+    for j in range(max(low, 0), min(high, away.size)):
+        value = abs(away[j])
+        if value > 0.0:
+            _insert(room, count, value)
+            count += 1
+    if count < _WINDOWS[0]:
+        return 0.0
+    return (1.0 - _ERROR / math.sqrt(count)) * room[count // 2] / _MEDIAN
+
+
+@njit(**INNER)
+def _loudest(away, i, room):  # type: ignore[no-untyped-def]
+    """How loud the noise right before or right after a sample is at least."""
+    found = 0.0
+    for window in _WINDOWS:
+        found = max(found, _level(away, i - 1 - window, i - 1, room), _level(away, i + 2, i + 2 + window, room))
+    return found
+
+
+@njit(**INNER)
+def _stands_out(row, away, i, limit):  # type: ignore[no-untyped-def]
+    """Whether a sample is far beyond each of the two beside it, on the same side, and none within two samples jumps out half as far."""
+    side = 1.0 if away[i] > 0.0 else -1.0
+    least = _ALONE * abs(away[i])
+    for j in range(max(i - 2, 0), min(i + 3, row.size)):
+        if j != i and (abs(away[j]) > max(limit, 0.5 * abs(away[i])) or (abs(i - j) == 1 and side * (row[i] - row[j]) < least)):
+            return False
+    return True
+
+
+@njit(**KERNEL)
+def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
+    """Samples that stand alone beyond a limit, and beyond that of noise which is louder for a while.
+
+    Parameters
+    ----------
+    x, away : ndarray, shape (block, sample)
+        Values and their `departures`.
+    deviation : ndarray, shape (block,)
+        Of the departures of a block; 0 where there are none.
+    limit : float
+        Deviations beyond which a departure may be a peak: of the block, and of the samples right before and right after it.
+
+    Returns
+    -------
+    block : ndarray of int64, shape (peak,)
+    size : ndarray, shape (peak,)
+        Absolute departure.
+    level : ndarray, shape (peak,)
+        Standard deviation of departures that the noise of the block has there at least: the largest of those right before and right
+        after it, and before and after the others that jump out within 16 samples, for a burst of noise is hardly longer.
+    """
+    count = 0
+    for b in range(x.shape[0]):
+        for i in range(x.shape[1]):
+            count += deviation[b] > 0.0 and abs(away[b, i]) > limit * deviation[b]
+    block, size, level = np.empty(count, np.int64), np.empty(count), np.empty(count)
+    place, loud = np.empty(count, np.int64), np.empty(count)
+    room = np.empty(_WINDOWS[-1])
+    found = 0
+    for b in range(x.shape[0]):
+        beyond = 0
+        for i in range(x.shape[1]):
+            if deviation[b] > 0.0 and abs(away[b, i]) > limit * deviation[b]:
+                place[beyond], loud[beyond] = i, _loudest(away[b], i, room)
+                beyond += 1
+        for k in range(beyond):
+            i = place[k]
+            level_here = 0.0
+            for other in range(max(k - _NEAR, 0), min(k + _NEAR + 1, beyond)):
+                if abs(place[other] - i) <= _NEAR:
+                    level_here = max(level_here, loud[other])
+            if abs(away[b, i]) > limit * level_here and _stands_out(x[b], away[b], i, limit * deviation[b]):
+                block[found], size[found], level[found] = b, abs(away[b, i]), level_here
+                found += 1
+    return block[:found], size[:found], level[:found]
