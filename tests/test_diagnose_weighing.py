@@ -172,3 +172,24 @@ def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near
     long |= {"frequency": float("nan"), "sign": 1, "z": 90.0, "p_value": 1e-9}
     short = long | {"axes": "x", "begin": begin, "end": begin + 10.0, "z": 80.0}
     assert len(merged([long, short])) == boxes
+
+
+@pytest.mark.parametrize(("axes", "told"), [("xy", ["spectral_line"]), ("x", [])])
+def test_a_line_on_two_axes_is_why_they_vary_together(shaken, axes, told):
+    _, baseline, _, null = shaken
+    quiet = record([])
+    band = int(np.flatnonzero(quiet["band_low"].values < 2.0)[-1])
+    level = np.sqrt((baseline["spectrum"][0] * baseline["spectrum"][1]).transpose("block", "band").values[:, band])
+    cross = quiet["cross"].transpose("pair", "block", "band").copy()
+    pair = [(str(a), str(b)) for a, b in zip(quiet["first"].values, quiet["second"].values, strict=True)].index(("x", "y"))
+    cross.values[pair, :, band] += 0.5 * level
+    shared = quiet.assign(cross=cross)
+    place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
+    candidates, _ = effect_candidates(shared, COEFFICIENT)
+    one = next(one for one in candidates if (one.effect, one.view) == ("spectral_line", "line"))
+    claim = Claim("spectral_line", (), tuple(axes), tuple(Part(one, one.variants[0], (axis,), 50.0, place) for axis in axes), 50.0, 8.0)
+    found = locate(shared, baseline, null)
+    found = found.isel(mismatch=found["view"].values == "cross_axis")
+    assert found.sizes["mismatch"] >= 1
+    lists = explanations(found, [claim], shared, baseline, null, level=0.005)
+    assert all(names == told for names in lists)

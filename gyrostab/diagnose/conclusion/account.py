@@ -24,7 +24,7 @@ _SHOWS: dict[str, tuple[str, ...]] = {
     "power": ("davar", "spectrum", "distribution"),
     "cross": ("cross_axis", "davar"),
     "marks": ("distribution", "davar", "spectrum"),
-    "line": ("spectrum", "davar", "distribution"),
+    "line": ("spectrum", "davar", "distribution", "cross_axis"),
     "order": ("spectrum", "davar", "mean", "distribution", "cross_axis"),
     "phase_locked": ("spectrum", "davar", "distribution", "mean"),
     "transfer": ("davar", "cross_axis", "spectrum", "mean", "distribution"),
@@ -175,8 +175,9 @@ def _beside(box: Mapping[str, Any], parts: Sequence[Part], left: Callable[[], tu
 
 def _modelled(claim: Claim, box: Mapping[str, Any]) -> set[str]:
     """Parts that must take the mismatch away; that several axes wander as one is in no model, and what wanders on them may do it."""
+    held = {*_MODELLED, "line"} if box["view"] == "cross_axis" else set(_MODELLED)
     wanders = str(box["what"]) == "slow" and len(set(str(box["axes"]).split()) & set(claim.axes)) > 1
-    return set(_MODELLED) - ({"wander"} if wanders else set())
+    return held - ({"wander"} if wanders else set())
 
 
 def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
@@ -188,6 +189,8 @@ def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
         return False
     if part.candidate.view in ("mean", "wander", "levels") and box["view"] == "cross_axis" and box["what"] != "slow":
         return False
+    if part.candidate.view == "line" and box["view"] == "cross_axis":
+        return str(box["what"]) != "slow"
     if part.candidate.view != "line" or part.place < 0 or box["view"] == "distribution":
         return True
     lines = reduced["line_frequency"].values

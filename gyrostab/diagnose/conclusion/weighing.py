@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.effects.cells import pair_rows
 from gyrostab.diagnose.effects.explained import Part, without_odd, without_turns
 from gyrostab.diagnose.effects.response import is_filter
 from gyrostab.diagnose.locating.locate import louder
@@ -26,7 +27,7 @@ _WEIGHED: dict[str, tuple[str, ...]] = {
     "davar": ("mean", "levels", "power", "cross", "marks", "line", "order", "phase_locked", "transfer"),
     "mean": ("mean", "levels", "marks"),
     "restart": ("mean", "levels", "marks"),
-    "cross_axis": ("mean", "levels", "cross"),
+    "cross_axis": ("mean", "levels", "cross", "line"),
     "distribution": ("power",),
 }
 _LEFT = 0.3  # of a mismatch, that an error of the form may leave
@@ -36,6 +37,7 @@ _FAIR = 0.5  # of an equal share
 def view_scores(reduced: xr.Dataset, after: xr.Dataset, null: NullScores, boxes: Sequence[Box], claims: Iterable[Claim] = ()) -> Scores:
     """Views of the recording against a baseline with effects in it; what is said of blocks leaves out those of odd samples of `claims`."""
     out = []
+    after = _with_shared_lines(reduced, after, claims := list(claims))
     seen = without_odd(reduced, [part for claim in claims for part in claim.parts])
     turns_left_out = without_turns(reduced, after["spectrum"].transpose("axis", "block", "band").values)
     special = {"distribution": turns_left_out, "restless": levelled(seen, after, louder(boxes))}
@@ -44,6 +46,32 @@ def view_scores(reduced: xr.Dataset, after: xr.Dataset, null: NullScores, boxes:
         if scores is not None:
             out.append((name, scores, standardise(scores, null.views[name])))
     return out
+
+
+def _with_shared_lines(reduced: xr.Dataset, after: xr.Dataset, claims: Sequence[Claim]) -> xr.Dataset:
+    """The baseline with the covariance of a line that axes have in common: its mean over the record, in the bands where the line is.
+
+    The lowest band stays as it is, for it tells what the means of the blocks share.
+    """
+    lines = [(part.place, part.row[0]) for claim in claims for part in claim.parts if part.candidate.view == "line" and part.place >= 0]
+    if "cross" not in reduced or len(lines) < 2:
+        return after
+    seen, shape = (reduced[name].transpose("pair", "block", "band").values for name in ("cross", "cross_shape"))
+    known = after["cross"].transpose("pair", "block", "band").values if "cross" in after else np.zeros_like(seen)
+    weight = np.where(np.isfinite(seen) & np.isfinite(shape), shape, 0.0)
+    total = weight.sum(axis=1)
+    mean = np.divide((np.nan_to_num(seen - known) * weight).sum(axis=1), total, out=np.zeros(total.shape, complex), where=total > 0.0)
+    reach = 1.0 / float(reduced.attrs["block_s"])
+    cross = known.copy()
+    for place in {place for place, _ in lines}:
+        frequency = float(reduced["line_frequency"].values[place])
+        bands = np.flatnonzero((reduced["band_low"].values <= frequency + reach) & (frequency - reach < reduced["band_high"].values))
+        axes = {axis for other, axis in lines if other == place}
+        for number, pair in enumerate(pair_rows(reduced)):
+            if set(pair) <= axes:
+                mine = bands[bands > 0]
+                cross[number][:, mine] = known[number][:, mine] + mean[number][mine]
+    return after.assign(cross=(("pair", "block", "band"), cross))
 
 
 def left_of(box: Box, scores: Scores, null: NullScores, level: float) -> tuple[float, float]:
