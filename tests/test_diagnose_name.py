@@ -170,6 +170,21 @@ def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
     assert raised.min() > 5.0
 
 
+def test_every_line_of_a_comb_is_named():
+    """More lines than other effects are looked for."""
+    quiet = record([])
+    comb = np.arange(5, quiet.sizes["line"], 7)
+    loud = np.ones(quiet.sizes["line"])
+    loud[comb] = 4.0
+    shape = xr.DataArray(np.stack([loud, np.ones_like(loud), np.ones_like(loud)]), dims=("axis", "line"))
+    reduced = quiet.assign(line_power=(quiet["line_power"] * shape).transpose(*quiet["line_power"].dims))
+    baseline, chance = nulls(quiet, 40)
+    found = name_effects(reduced, baseline, chance)
+    assert {(claim.effect, claim.axes) for claim in found.claims} == {("spectral_line", ("x",))}
+    assert sorted(part.place for claim in found.claims for part in claim.parts) == comb.tolist()
+    assert comb.size == 14
+
+
 def test_a_line_stands_out_at_its_place_only():
     rng = np.random.default_rng(5)
     weight = np.full((1, 8), 22.0)

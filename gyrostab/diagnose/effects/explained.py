@@ -26,6 +26,7 @@ __all__ = [
     "power_shares",
     "reweighted",
     "take_part",
+    "take_parts",
     "without_odd",
     "without_turns",
 ]
@@ -68,9 +69,14 @@ def mirrored(part: Part) -> bool:
 
 def explain_away(state: State, parts: list[Part]) -> State:
     """The state with an effect in it."""
+    return reweighted(take_parts(state, parts))
+
+
+def take_parts(state: State, parts: Iterable[Part]) -> State:
+    """The state with rows of effects in it, before its powers are fitted anew."""
     for part in parts:
         state = take_part(state, part)
-    return reweighted(state)
+    return state
 
 
 def take_part(state: State, part: Part) -> State:
@@ -230,9 +236,12 @@ def _line(state: State, part: Part) -> State:
     frequency = float(state.reduced["line_frequency"].values[part.place])
     axis = part.row[0]
     density = _bands_of(state, np.asarray(frequency)).astype(float)
+    known = state.given.get(("power", axis), [])
     for band in np.flatnonzero(density.any(axis=0)):
         column = np.zeros_like(density)
         column[:, band] = 1.0
+        if any(np.array_equal(column, other) for other in known):
+            continue  # another line in the same band has made it free already
         state = state.with_columns("power", axis, [column])
         state = _coherent(state, (axis,), column)
     return state.with_columns("line", "all", [line_skirt(state.reduced, axis, part.place)])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.calibration.lattice import rounded_rates
 from gyrostab.diagnose.effects.candidates import Candidate, effect_candidates
 from gyrostab.diagnose.effects.cells import State, begin_state
-from gyrostab.diagnose.effects.explained import Part, explain_away
+from gyrostab.diagnose.effects.explained import Part, explain_away, reweighted, take_parts
 from gyrostab.diagnose.effects.generics import generic_candidates
 from gyrostab.diagnose.effects.search import Found, Tallies, gains, totals
 from gyrostab.diagnose.gains.folds import fold_blocks
@@ -23,7 +23,7 @@ from gyrostab.diagnose.naming.complete import flexible, redness, unrest
 from gyrostab.diagnose.naming.filters import without_slopes
 from gyrostab.diagnose.naming.layers import found_again, layers
 from gyrostab.diagnose.naming.levels import followed_first, renewed
-from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, parts_of, tried_again, without_lines
+from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, lines_only, parts_of, tried_again, without_lines
 from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural
 from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.errors import OptionError
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 AMBIGUOUS = 3.0
 #: Of the gain of what is named, what an error of its form may leave: 10 % of its size.
 FORM = 0.01
-_ROUNDS = 10
+_ROUNDS, _LINES = 10, 40  # names that are sought in turn: of lines as many beside, for what turns or switches makes combs of them
 _LEAST_NULLS = 40
 _LEFT = 2.0  # nats that may be left, beside errors of the form
 _SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
@@ -155,13 +155,16 @@ class _Search:
         chosen: list[Claim | Unknown] = []
         state = start
         barred: set[str] = set()
-        for _ in range(_ROUNDS):
+        rounds, lines = _ROUNDS, _LINES
+        while rounds and lines:
             found = self._ranked(state, barred)
             pick = self._pick(found, state, chosen)
             if pick is None:
                 break
             one, rejected = pick
             barred |= rejected
+            line = one is not None and lines_only(one.parts)
+            rounds, lines = rounds - (not line), lines - line
             if one is not None:
                 chosen = with_claim(chosen, one)
                 barred |= self._counted(one)
@@ -260,11 +263,14 @@ class _Search:
         return Claim(first.effect, first.driver, axes, tuple(parts), gain_sum(parts), threshold, others, p_value)
 
     def _with(self, start: State, chosen: Sequence[Claim | Unknown], without: Claim | Unknown | None = None) -> State:
-        state = start
-        for one in chosen:
-            if one is not without:
-                state = explain_away(state, list(one.parts))
-        return state
+        state, waiting = start, False
+        for one in (one for one in chosen if one is not without):
+            if lines_only(one.parts):  # what they add to the powers is fitted once for all of a comb
+                state, waiting = take_parts(state, one.parts), True
+                continue
+            state = explain_away(reweighted(state) if waiting else state, list(one.parts))
+            waiting = False
+        return reweighted(state) if waiting else state
 
     def _pruned(self, start: State, chosen: list[Claim | Unknown]) -> list[Claim | Unknown]:
         """Without what no longer passes when the others are in, the weakest first; and claims only on axes that still show them."""

@@ -10,7 +10,7 @@ from gyrostab.diagnose.effects.candidates import Candidate
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.search import Found, together
 
-__all__ = ["LEAST", "PLAIN_LINE", "axes_of", "by_key", "gain_of", "gain_sum", "parts_of", "tried_again", "without_lines"]
+__all__ = ["LEAST", "PLAIN_LINE", "axes_of", "by_key", "gain_of", "gain_sum", "lines_only", "parts_of", "tried_again", "without_lines"]
 
 #: What an axis must bring to be named with the others [nats].
 LEAST = 2.0
@@ -59,6 +59,11 @@ def without_lines(parts: dict[str, list[Part]]) -> dict[str, list[Part]]:
         if kept:
             out[key] = kept
     return out
+
+
+def lines_only(parts: Sequence[Part]) -> bool:
+    """Whether all that these parts say is that lines are there."""
+    return bool(parts) and all(part.candidate.view == "line" for part in parts)
 
 
 def gain_sum(parts: Sequence[Part]) -> float:
