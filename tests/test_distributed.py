@@ -36,8 +36,8 @@ def address(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cluster")
     where = folder / "scheduler.json"
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
-    scheduler = "scheduler --host 127.0.0.1 --port 0".split()
-    worker = "worker --host 127.0.0.1 --nworkers 2 --nthreads 1 --memory-limit 0".split()
+    scheduler = ["scheduler", "--host", "127.0.0.1", "--port", "0"]
+    worker = ["worker", "--host", "127.0.0.1", "--nworkers", "2", "--nthreads", "1", "--memory-limit", "0"]
     with ExitStack() as stack:
         for command in (scheduler, [*worker, "--local-directory", str(folder)]):
             stack.enter_context(_program("dask", *command, "--scheduler-file", str(where), "--no-dashboard", env=environment))

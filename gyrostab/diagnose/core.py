@@ -6,6 +6,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
-from gyrostab.diagnose.calibration.known import without_known_lines
-from gyrostab.diagnose.conclusion.account import explanations
+from gyrostab.diagnose.calibration.known import known_motion, without_known_lines
+from gyrostab.diagnose.conclusion.account import explanations, unexpected
 from gyrostab.diagnose.conclusion.content import (
     baseline_table,
     claim_tables,
@@ -35,6 +36,7 @@ from gyrostab.diagnose.effects.explained import without_odd
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import NullScores, null_scores
+from gyrostab.diagnose.modelling.expected import expected_baseline, fit_expected, without_expected
 from gyrostab.diagnose.modelling.limits import limits
 from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
@@ -45,6 +47,7 @@ from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
 from gyrostab.diagnose.naming.name import Naming, name_effects
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError, SchemaError
+from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import check_log
 from gyrostab.simulate.model import Model, read_model
@@ -144,22 +147,31 @@ def _diagnose(
         reduced = reduce_log(log.sel(axis=alive), block=block, restart_gap=restart_gap, progress=progress)
         given = given.sel(axis=alive) if isinstance(given, xr.Dataset) else given
 
-    def compared(reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset, Naming, NullScores]:
+    def compared(reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset, Naming, NullScores]:
         progress("calibrating", 0)
         baseline = _baseline(reduced, given, quiet, restart_gap, progress)
-        reduced = without_known_lines(reduced, baseline)
-        records = _records(reduced, baseline, nulls, seed)
+        if isinstance(given, Model) and (turning := known_motion(reduced, baseline)).any():
+            left = without_motion(log.sel(axis=alive), reduced, turning, restart_gap=restart_gap, progress=progress)
+            reduced = left.drop_vars("moving")  # it is accounted for
+            baseline = _baseline(reduced, given, quiet, restart_gap, progress)
+        seen = without_known_lines(reduced, baseline)
+        records = _records(seen, baseline, nulls, seed)
         progress("comparing", 0)
         null = null_scores(baseline, records())
-        found = locate(reduced, baseline, null, level=level / 2.0)  # the other half is for the names
         progress("naming", 0)
-        return baseline, found, name_effects(reduced, baseline, records(), level=level / 2.0, seed=seed, progress=progress), null
+        known = _known_apart(baseline, given)
+        naming = name_effects(seen, baseline, records(), level=level / 2.0, seed=seed, known=known, progress=progress)
+        before = expected_baseline(naming, baseline)
+        found = locate(
+            without_expected(seen, baseline, naming.expected), before, null, level=level / 2.0
+        )  # the other half is for the names
+        return reduced, baseline, unexpected(found, naming.expected, seen, before, null, level=level / 2.0), naming, null
 
-    baseline, found, naming, null = compared(reduced)
+    reduced, baseline, found, naming, null = compared(reduced)
     moving = unexplained_motion(reduced, naming.claims) if given is None else np.zeros(1, np.bool_)
     if moving.any():
         reduced = without_motion(log.sel(axis=alive), reduced, moving, restart_gap=restart_gap, progress=progress)
-        baseline, found, naming, null = compared(reduced)
+        reduced, baseline, found, naming, null = compared(reduced)
     progress("fitting", 0)
     own = given if isinstance(given, Model) else None
     return _concluded(reduced, baseline, found, naming, null, level=level, given=own, begun=begun)
@@ -233,6 +245,11 @@ def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -
     return recall
 
 
+def _known_apart(baseline: xr.Dataset, given: xr.Dataset | Model | None) -> list[Effect]:
+    """Effects of the model that its baseline leaves out, in part or whole."""
+    return [one for one in given.effects if one.name in baseline.attrs["left_out"]] if isinstance(given, Model) else []
+
+
 def _concluded(
     reduced: xr.Dataset,
     baseline: xr.Dataset,
@@ -249,7 +266,8 @@ def _concluded(
     noise = recalibrate(naming, baseline, first)
     naming, raw = (naming, naming) if noise is baseline else (with_noise(naming, noise), naming)
     fitted = first if noise is baseline else fit_claims(naming, noise)
-    after = predicted(naming, noise) if naming.claims else baseline
+    before = expected_baseline(naming, baseline)
+    after = predicted(naming, noise) if naming.claims else before
 
     told, hopping = without_levels(raw)
 
@@ -259,7 +277,9 @@ def _concluded(
 
     parts = [part for claim in told.claims for part in claim.parts]
     odd = sum(part.gain for part in parts if part.candidate.view == "marks")  # no other number has them
-    held = held_out(without_odd(reduced, parts), baseline, trained if told.claims else baseline, more_gain=odd + hopping)
+    clean = without_odd(reduced, [*parts, *(part for claim in told.expected for part in claim.parts)])
+    start = partial(expected_baseline, told, baseline) if told.expected else baseline
+    held = held_out(clean, start, trained if told.claims else start, more_gain=odd + hopping)
 
     def without(left_out: Sequence[Claim]) -> xr.Dataset:
         return predicted(naming, noise, left_out=left_out)
@@ -273,7 +293,7 @@ def _concluded(
     content = {
         "schema": SCHEMA,
         "recording": recording_table(reduced),
-        "baseline": baseline_table(baseline),
+        "baseline": baseline_table(baseline, fit_expected(naming, baseline)),
         "verdict": verdict(mismatches, naming.claims, unexplained),
         "false_alarm_level": level,
         "mismatches": mismatches,
@@ -283,7 +303,7 @@ def _concluded(
         "held_out": {name: held[name] for name in HELD_OUT},
         "seconds": round(time.perf_counter() - begun, 3),
     }
-    surfaces = surfaces_with_blocks(make_surfaces(reduced, baseline, after), reduced, baseline, after)
+    surfaces = surfaces_with_blocks(make_surfaces(reduced, before, after), reduced, before, after)
     diagnosis = Diagnosis(plain(content), surfaces, model_tables(noise, fitted, given))
     check_diagnosis(diagnosis.content)
     return diagnosis

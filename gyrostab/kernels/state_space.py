@@ -123,7 +123,7 @@ def whiten(
     variance: Array,
     step_seconds: Array,
     present: NDArray[np.bool_],
-    K2: float,
+    K2: Array,
     ou_variance: Array,
     ou_time: Array,
 ) -> tuple[Array, float]:
@@ -141,8 +141,8 @@ def whiten(
         Length of every block, which ends where the next one begins [s].
     present : ndarray of bool, shape (n,)
         False for blocks that are missing or held out.
-    K2 : float
-        Variance of the random walk in a second.
+    K2 : ndarray, shape (n,)
+        Growth of the variance of the random walk in a second, in every block.
     ou_variance, ou_time : ndarray, shape (p,)
         Variances and correlation times [s] of the Ornstein-Uhlenbeck processes.
 
@@ -162,11 +162,11 @@ def whiten(
     covariance = np.zeros((m, m))
     for j in range(1, m):
         covariance[j, j] = ou_variance[j - 1]
-    total, known, last, rest = 0.0, False, np.nan, 0.0
+    total, known, last, walked, rest = 0.0, False, np.nan, np.nan, 0.0
     for i in range(n):
-        if step_seconds[i] != last:
-            last = step_seconds[i]
-            rest = _moments(last, K2, ou_variance, ou_time, decay, weight, drive, shared)
+        if step_seconds[i] != last or K2[i] != walked:
+            last, walked = step_seconds[i], K2[i]
+            rest = _moments(last, walked, ou_variance, ou_time, decay, weight, drive, shared)
         if not present[i]:
             for j in range(m):
                 for c in range(width):

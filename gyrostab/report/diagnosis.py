@@ -103,6 +103,7 @@ def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     )
     spans = "; ".join(f"{_stamp(first)} to {_stamp(last)}" for first, last in baseline["calibrated_on"][:6])
     more = len(baseline["calibrated_on"]) - 6
+    expected = " ".join(one["statement"] for one in baseline.get("expected", []))
     return [
         ("Recording", _recording(content)),
         ("Span (UTC)", f"{_stamp(recording['start'])} to {_stamp(recording['end'])}, {length_text(float(length))}"),
@@ -110,6 +111,7 @@ def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Channels", ", ".join(recording["channels"]) or "none"),
         ("Missing samples", f"{100.0 * recording['missing_share']:.2g} %"),
         ("Simulation compared with", _SOURCE[baseline["source"]]),
+        *([("Expected, with the size it has here", expected)] if expected else []),
         *([("Quiet stretches (UTC)", spans + (f" and {more} more" if more > 0 else ""))] if spans else []),
         ("Time taken", f"{content['seconds']:.3g} s"),
     ]

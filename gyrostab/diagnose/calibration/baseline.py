@@ -13,11 +13,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.calibration.expected import NOISE, common_variance, noise_powers, white_variance
-from gyrostab.diagnose.calibration.known import known_effects
+from gyrostab.diagnose.calibration.expected import NOISE, common_variance, line_columns, noise_powers, white_variance
+from gyrostab.diagnose.calibration.known import evenness, known_effects
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
 from gyrostab.diagnose.calibration.quiet import loudness, quiet_blocks, quiet_spans
 from gyrostab.diagnose.calibration.simulated import odd_band, shown_by, with_shown
+from gyrostab.diagnose.calibration.wandering import with_wandering
 from gyrostab.diagnose.gains.products import mean_products
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import HOUR, LAWS, TERMS
@@ -274,11 +275,15 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
     attrs = {"source": "model", "calibrated_on": [], "model": made.source, "left_out": known.left_out}
     quiet = np.ones((len(axes), reduced.sizes["block"]), np.bool_)
     out = assemble(reduced, found, quiet=quiet, attrs=attrs, known_mean=known.mean + ramp[:, None] * hours, spectrum=known.spectrum)
+    out = with_wandering(out, known.wandering, known.spectrum)
     if known.cross is not None:
         out["cross"] = (("pair", "block", "band"), known.cross, {"long_name": "expected cross-spectrum", "units": _POWER})
     for name, values in known.lines.items():
         last = "band" if name == "line_spectrum" else "line"
         out[name] = (("axis", last), values, {"long_name": "expected power of lines", "units": _POWER})
+    if known.lines:
+        noise = np.stack([line_columns(reduced) @ one.square for one in found])
+        out["shape_alone"] *= evenness(noise + known.lines["peaks"], reduced)[:, None]
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"][:] = 0.0
     return out

@@ -11,11 +11,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.conclusion.weighing import Scores, left_of, needed, view_scores
-from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.explained import Part, odd_blocks
 from gyrostab.diagnose.locating.null_scores import NullScores
 from gyrostab.diagnose.naming.name import Claim
 
-__all__ = ["acting", "explanations", "spans"]
+__all__ = ["acting", "explanations", "spans", "unexpected"]
 
 Array = NDArray[np.float64]
 #: Where an effect shows -> views of mismatches that it can explain; "model" ones are looked at again with the effect in the model.
@@ -160,6 +160,31 @@ def explanations(
         kept = needed(box, shown, partial(left, box)) if several else [claim for claim, _ in shown]
         told.append(list(dict.fromkeys(claim.effect for claim in kept)))
     return told
+
+
+def unexpected(
+    found: xr.Dataset, expected: Sequence[Claim], reduced: xr.Dataset, before: xr.Dataset, null: NullScores, *, level: float
+) -> xr.Dataset:
+    """Mismatches without those that effects explain which the simulation has as well.
+
+    Parameters
+    ----------
+    found : xarray.Dataset
+        Located where odd samples that are expected were left out; so these explain what is odd and no more.
+    expected : sequence of Claim
+    reduced, before : xarray.Dataset
+        The recording, and the baseline with these effects.
+    null : NullScores
+    level : float
+    """
+    odd = [one for one in expected if any(part.candidate.view == "marks" and odd_blocks(part, reduced).any() for part in one.parts)]
+    others = [one for one in expected if one not in odd]
+    by_count, by_all = (explanations(found, claims, reduced, before, null, level=level) for claims in (odd, others))
+    told = [
+        bool(named) or (bool(counted) and view == "distribution")
+        for view, counted, named in zip(found["view"].values, by_count, by_all, strict=True)
+    ]
+    return found.isel(mismatch=~np.array(told, np.bool_)) if expected else found
 
 
 def _beside(box: Mapping[str, Any], parts: Sequence[Part], left: Callable[[], tuple[float, float]]) -> bool:

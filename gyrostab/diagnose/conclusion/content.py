@@ -84,8 +84,8 @@ def recording_table(reduced: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def baseline_table(baseline: xr.Dataset) -> dict[str, Any]:
-    """The noise that the recording is compared with."""
+def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str, Any]:
+    """The noise that the recording is compared with, and the effects of the simulation that have the size which the recording shows."""
     noise: dict[str, Any] = {}
     for axis in baseline["axis"].values:
         noise[str(axis)] = {}
@@ -93,7 +93,9 @@ def baseline_table(baseline: xr.Dataset) -> dict[str, Any]:
             value, error = (float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr"))
             noise[str(axis)][str(term)] = {"value": value, "stderr": error if math.isfinite(error) else None, "unit": LAWS[str(term)].label}
     spans = baseline.attrs.get("calibrated_on", [])
-    return {"source": baseline.attrs["source"], "noise": noise, "calibrated_on": [list(span) for span in spans]}
+    known = [{"name": one.claim.effect, "axes": list(one.axes), "statement": one.say()} for one in expected]
+    table = {"source": baseline.attrs["source"], "noise": noise, "calibrated_on": [list(span) for span in spans]}
+    return {**table, "expected": known} if known else table
 
 
 def mismatch_tables(found: xr.Dataset, reduced: xr.Dataset, explained: Sequence[Sequence[str]]) -> list[dict[str, Any]]:

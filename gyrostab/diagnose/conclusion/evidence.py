@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.gains.folds import FOLDS
 from gyrostab.diagnose.gains.products import mean_products
+from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.views.cells import Array, Windows, cube_root_score, values_of
 from gyrostab.diagnose.views.davar import allan_surface
 from gyrostab.diagnose.views.mean import window_means
@@ -198,6 +199,7 @@ def _mean_evidence(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, used: N
         K=np.asarray(walk, dtype=float),
         B=np.asarray(flicker, dtype=float),
         present=present,
+        wander=known_wander(baseline, axis),
     )
     log = weight - np.logaddexp.reduce(weight) - 0.5 * (found.square[:, 0] + found.log_determinant)
     return float(np.logaddexp.reduce(log))

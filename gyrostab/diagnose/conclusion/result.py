@@ -112,6 +112,7 @@ _FIELDS: dict[str, dict[str, Any]] = {
         "files": list, "axes": list, "start": str, "end": str, "sampling_rate_hz": _NUMBER, "channels": list, "missing_share": _NUMBER,
     },
     "baseline": {"source": str, "noise": dict, "calibrated_on": list},
+    "expected": {"name": str, "axes": list, "statement": str},
     "noise": {"value": _NUMBER, "stderr": _LATER, "unit": str},
     "mismatch": {
         "id": int, "view": str, "axes": list, "start": str, "end": str, "tau_min_s": _LATER, "tau_max_s": _LATER, "ratio": _LATER,
@@ -203,6 +204,8 @@ def _check_baseline(baseline: Mapping[str, Any]) -> None:
             _require(entry, "noise", where)
     for span in baseline["calibrated_on"]:
         _times(span, "baseline.calibrated_on")
+    for number, effect in enumerate(baseline.get("expected", [])):
+        _require(effect, "expected", f"baseline.expected[{number}]")
 
 
 def _check_mismatch(box: Mapping[str, Any], where: str, names: list[Any]) -> None:

@@ -36,6 +36,7 @@ Array = NDArray[np.float64]
 FLOOR = 0.2
 _LINE_REACH = 3  # lines on each side of one that belong to it
 _FEW = 0.5  # of the blocks at most may be masked
+_ODD = 0.75  # of them may be left out for odd samples
 _TURN = 0.2  # change of the logarithm of the noise power from block to block
 
 
@@ -273,9 +274,9 @@ def _everywhere(part: Part) -> bool:
 def odd_blocks(part: Part, reduced: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks with odd samples, which are left out on the axis; none where they would be too many, or the effect is in all alike."""
     count = reduced[part.variant.columns[0]].sel(axis=part.row[0]).values if not _everywhere(part) else np.zeros(reduced.sizes["block"])
-    usual = np.median(count)
+    usual = 0.0 if part.variant.columns[0] == "outliers" else np.median(count)  # noise has as good as none
     odd = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
-    return np.asarray(odd & (odd.mean() <= _FEW))
+    return np.asarray(odd & (odd.mean() <= _ODD))
 
 
 def without_odd(reduced: xr.Dataset, parts: Iterable[Part]) -> xr.Dataset:

@@ -13,6 +13,7 @@ from gyrostab.diagnose.effects.candidates import Variant
 from gyrostab.diagnose.effects.cells import State, cells_of, view_rows
 from gyrostab.diagnose.effects.explained import Part, mean_columns
 from gyrostab.diagnose.gains.products import mean_products
+from gyrostab.diagnose.gains.wander import known_wander
 
 __all__ = ["Mixture", "mean_mixture", "part_mixture", "part_size"]
 
@@ -73,6 +74,7 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
         variance=baseline["mean_variance"].sel(axis=axis).values,
         step=float(state.reduced.attrs["block_s"]),
         present=present,
+        wander=known_wander(baseline, axis),
         **grid,
     )
     prior = baseline["grid_prior" if tier == "free" else "grid_calibrated"].sel(axis=axis).values

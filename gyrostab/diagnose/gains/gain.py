@@ -33,6 +33,7 @@ from gyrostab.diagnose.gains.products import (
     share_out,
     take_out,
 )
+from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.errors import OptionError
 
 __all__ = [
@@ -124,6 +125,7 @@ def mean_factors(
         "variance": np.asarray(baseline["mean_variance"].sel(axis=axis).values, dtype=np.float64),
         "step": float(data["end"][0] - data["begin"][0]),
         "pairs": pairs_of(columns.shape[1], numbers, beside.shape[1]),
+        "wander": known_wander(baseline, axis),
     }
     white = mean_products(values[:, :0], columns, **frame, K=np.zeros(1), B=np.zeros(1), present=present)
     before = (np.where(present[:, None], columns, 0.0) ** 2 / frame["variance"][:, None])[present].sum(axis=0)

@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.gains.products import WIDTHS, mean_products, pairs_of, take_out
+from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.kernels.evidence import mixed_evidence
 from gyrostab.kernels.levels import level_tables, levels_smooth
 
@@ -209,6 +210,7 @@ def level_gains(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Arr
         "variance": variance,
         "step": float(data["end"][0] - data["begin"][0]),
         "present": present,
+        "wander": known_wander(baseline, axis),
     }
     grid: dict[str, Any] = {name: baseline[f"grid_{name}"].sel(axis=axis).values for name in ("K", "B")}
     log_weight = baseline["grid_prior"].sel(axis=axis).values

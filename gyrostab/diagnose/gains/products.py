@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.gains.folds import FOLDS
+from gyrostab.diagnose.gains.wander import Wander
 from gyrostab.kernels.evidence import chosen_products, mixed_evidence
 from gyrostab.kernels.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
@@ -93,6 +94,7 @@ def mean_products(
     B: Array,
     present: NDArray[np.bool_],
     pairs: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
+    wander: Wander | None = None,
 ) -> Products:
     """Products of block means and columns, whitened for every pair of K and B.
 
@@ -112,19 +114,25 @@ def mean_products(
         Blocks that are used.
     pairs : two ndarrays, optional
         Columns whose products with each other are asked for, from `pairs_of`; all by default. The other products stay 0.
+    wander : Wander, optional
+        What is there beside, whatever K and B are.
     """
     n, width = columns.shape
     both = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
     both[~present] = 0.0
     spread = np.where(present, variance, 1.0)
     share, time, white = flicker_states(step, n * step)
-    steps = np.full(n, step)
+    steps, walk = np.full(n, step), np.zeros(n)
+    if wander is not None:
+        walk = walk + wander.walk
     shape = (K.size, values.shape[1])
     square, cross = np.empty(shape), np.empty((K.size, width, shape[1]))
     gram, determinant = np.zeros((K.size, width, width)), np.empty(K.size)
     for g, (k, b) in enumerate(zip(K**2 / HOUR, B**2, strict=True)):
         states = (share * b, time) if b > 0.0 else (share[:0], time[:0])
-        done, determinant[g] = whiten(both, spread + b * white, steps, present, float(k), *states)
+        if wander is not None:
+            states = (np.append(states[0], wander.square), np.append(states[1], wander.time))
+        done, determinant[g] = whiten(both, spread + b * white, steps, present, k + walk, *states)
         x, y = done[:, :width], done[:, width:]
         cross[g], square[g] = x.T @ y, np.einsum("ij,ij->j", y, y)
         if pairs is None:

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from gyrostab.diagnose.calibration.expected import line_columns, white_variance
+from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.locating.shared import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.outliers import CHANCE, beyond_chance
 from gyrostab.kernels.periodogram import taper
-from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times
+from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times, ornstein_uhlenbeck_means
 from gyrostab.noise import HOUR
 
 __all__ = ["null_records"]
@@ -93,13 +94,15 @@ def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) 
     for square in baseline["square"].values:
         density = lines @ square
         sd.append([np.sqrt(level) for level in (_variance(reduced, density), 2.0 * _variance(reduced, density, difference=True))])
-    tails = np.array([_tails(reduced, lines * square, rng) for square in baseline["square"].values])
+    peaks = _ordered(baseline, "peaks", "axis", "line") if "peaks" in baseline else np.zeros((len(sd), len(lines)))
+    density = [np.column_stack([lines * square, peak]) for square, peak in zip(baseline["square"].values, peaks, strict=True)]
+    tails = np.array([_tails(reduced, one, rng) for one in density])
     shape = _ordered(reduced, "shape", "axis", "block", "band")
     return _Frame(reduced, baseline, shape, columns, effects, np.array(sd), tails, shared_by(reduced, baseline))
 
 
 def _tails(reduced: xr.Dataset, density: Array, rng: np.random.Generator) -> tuple[float, float]:
-    """Kurtosis of full blocks of this noise (line, term): memory widens its scatter, the rounding of an angle is not Gaussian."""
+    """Kurtosis of full blocks of noise (line, term): memory widens its scatter, a resonance swings, the rounding of an angle has edges."""
     size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
     shaped = np.zeros(size // 2 + 1)
     shaped[1 : len(density) + 1] = density[:, 1:].sum(axis=1)
@@ -170,7 +173,7 @@ def _gamma(shape: Array, mean: Array, rng: np.random.Generator) -> Array:
 
 
 def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator) -> Array:
-    """Block means: white noise, random walk and flicker as means over the blocks."""
+    """Block means: white noise, random walk, flicker and what else is known to wander, as means over the blocks."""
     reduced, baseline = frame.reduced, frame.baseline
     n, step = reduced.sizes["block"], float(reduced.attrs["block_s"])
     each = np.stack([white_variance(reduced, np.tile(unit, (len(slow[0]), 1))) for unit in np.eye(4)[:2]], axis=-1)
@@ -184,9 +187,13 @@ def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator)
     for place in np.ndindex(*white.shape[:2]):
         B2, K2 = slow[place]
         flicker, _ = flicker_means(rng.standard_normal((n, times.size + 1)), times, 1.0 / step, rng.standard_normal(times.size))
-        steps = rng.standard_normal((2, n)) * np.sqrt(K2 * step / HOUR)
+        known = known_wander(baseline, place[1])
+        steps = rng.standard_normal((2, n)) * np.sqrt((K2 / HOUR + known.walk) * step)
         walk, _ = brownian_means(steps[0], steps[1], 0.0)
         total[place] += np.sqrt(B2) * flicker + walk
+        for square, memory in zip(known.square, known.time, strict=True):
+            wander, _ = ornstein_uhlenbeck_means(rng.standard_normal((n, 2)), memory / step, float(rng.standard_normal()))
+            total[place] += np.sqrt(square) * wander
     total[..., np.isnan(_ordered(reduced, "mean", "axis", "block"))] = np.nan
     return np.asarray(total)
 

@@ -36,7 +36,7 @@ def limits(naming: Naming) -> dict[str, Limit]:
     dict of str to Limit
         95 % limit of the effect's first size, the largest over axes; of effects in means and powers.
     """
-    named = {claim.effect for claim in naming.claims}
+    named = {claim.effect for claim in (*naming.expected, *naming.claims)}
     out = {}
     for name, kind in effects().items():
         if name in named:

@@ -25,7 +25,7 @@ def predicted(
     Parameters
     ----------
     naming : Naming
-        The effects; their nuisance parameters are kept.
+        The effects, with those that were expected; their nuisance parameters are kept.
     baseline : xarray.Dataset
         That the naming started from.
     known : ndarray of bool, shape (block,), optional
@@ -46,7 +46,8 @@ def predicted(
             seen[name] = seen[name].where(xr.DataArray(keep, dims="block"))
     state = begin_state(seen, baseline)
     mine: dict[tuple[str, str], list[bool]] = {}  # of each given column: it is of an effect that is left out
-    for claim in naming.claims:
+    claims = (*naming.expected, *naming.claims)
+    for claim in claims:
         state = explain_away(state, list(claim.parts))
         for place, columns in state.given.items():
             known_of = mine.setdefault(place, [])
@@ -65,7 +66,7 @@ def predicted(
         spectrum=baseline["spectrum"].transpose("axis", "block", "band").copy(data=weight),
         known_mean=baseline["known_mean"].transpose("axis", "block").copy(data=mean),
     )
-    there = [claim for claim in naming.claims if not any(claim is one for one in left_out)]
+    there = [claim for claim in claims if not any(claim is one for one in left_out)]
     shared = [part for claim in there for part in claim.parts if part.candidate.view == "cross"]
     if not shared:
         return after

@@ -19,7 +19,7 @@ from gyrostab.diagnose.modelling.levels import level_sizes
 from gyrostab.diagnose.modelling.nuisance import sizes_over
 from gyrostab.diagnose.modelling.shared import shared_sizes
 from gyrostab.diagnose.naming.filters import filter_sizes
-from gyrostab.diagnose.naming.name import Claim, Naming
+from gyrostab.diagnose.naming.name import Claim, Naming, Unknown
 from gyrostab.diagnose.naming.odd import line_size, mark_sizes
 from gyrostab.diagnose.naming.plainer import plainer
 from gyrostab.errors import GyrostabError
@@ -103,9 +103,10 @@ def fit_claims(naming: Naming, baseline: xr.Dataset) -> list[Fitted]:
     found: list[Fitted] = []
     for claim in naming.claims:
         state = start
-        rest = [one.parts for one in naming.claims if one is not claim] + [one.parts for one in naming.unknown]
-        for parts in rest:
-            state = explain_away(state, list(parts))
+        everything: list[Claim | Unknown] = [*naming.expected, *naming.claims, *naming.unknown]
+        for one in everything:
+            if one is not claim:
+                state = explain_away(state, list(one.parts))
         state = replace(state, weight=naming.state.weight, masked=naming.state.masked)
         found += _fit_claim(claim, state, naming)
     return found

@@ -102,6 +102,8 @@ class Naming:
         With all that was named.
     folds : xarray.DataArray
     tallies : Tallies
+    expected : tuple of Claim
+        Effects that the simulation has as well, with the size and course that the recording gives them; they are in `state` too.
     """
 
     claims: tuple[Claim, ...]
@@ -113,6 +115,7 @@ class Naming:
     state: State
     folds: xr.DataArray
     tallies: Tallies = field(default_factory=lambda: Tallies({}))
+    expected: tuple[Claim, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -161,10 +164,15 @@ def form_error(parts: Sequence[Part], chosen: Sequence[Claim | Unknown], *, shar
     error = 0.0
     for one in chosen:
         for part in one.parts:
-            beside = [effect for view, axes, effect in views if _kind(part) == view and axes & set(part.row)]
+            beside = [effect for view, axes, effect in views if view in _leaves(part) and axes & set(part.row)]
             of_spectrum = part.candidate.view == "power" and isinstance(one, Claim) and bool(one.driver) and _FILTER in beside
             error += max(_SPECTRUM if of_spectrum else 0.0, share) * part.gain if beside else 0.0
     return error
+
+
+def _leaves(part: Part) -> tuple[str, ...]:
+    """Views in which an error of the form of a part shows: a harmonic that is not quite where it should be is power, and shared."""
+    return ("order", "power", "cross") if part.candidate.view == "order" else (_kind(part),)
 
 
 def _kind(part: Part) -> str:

@@ -20,6 +20,7 @@ from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.gains.tallies import Expected
 from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown, form_error, unknown_of, with_axes_of, with_claim
 from gyrostab.diagnose.naming.complete import flexible, redness, unrest
+from gyrostab.diagnose.naming.expected import expected_claims
 from gyrostab.diagnose.naming.filters import without_slopes
 from gyrostab.diagnose.naming.layers import found_again, layers
 from gyrostab.diagnose.naming.levels import followed_first, renewed
@@ -27,6 +28,7 @@ from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum
 from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural
 from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.errors import OptionError
+from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 
 __all__ = ["Claim", "Naming", "Unknown", "name_effects", "tail_level"]
@@ -53,6 +55,7 @@ def name_effects(
     *,
     level: float = 0.005,
     seed: int = 0,
+    known: Sequence[Effect] = (),
     progress: Stage = no_stage,
 ) -> Naming:
     """Name the effects that a recording shows beyond its baseline.
@@ -69,6 +72,8 @@ def name_effects(
         Probability that noise alone gets a name, or is called unknown.
     seed : int
         Of the draws for views that the null records do not hold.
+    known : sequence of Effect
+        That the simulation has as well, but not the baseline: they are in the model before anything is named.
     progress : Stage
         Is told of the null records done.
 
@@ -82,15 +87,16 @@ def name_effects(
         When there are too few null records.
     """
     folds = fold_blocks(reduced)
-    known, reasons = effect_candidates(reduced, baseline["coefficient"])
-    candidates = [*known, *generic_candidates(reduced)]
+    tried, reasons = effect_candidates(reduced, baseline["coefficient"])
+    candidates = [*tried, *generic_candidates(reduced)]
     state = begin_state(reduced, baseline)
     best, tallies = _null_best(candidates, nulls, state, folds, np.random.default_rng(seed), progress)
     if not tallies.rounded.any() and (reduced["lattice"] > 0.0).any():
         reasons |= {"rate_quantization": "not identifiable: the lattice of values is that of angles, or too fine to show"}
-    search = _Search(candidates, folds, tallies, tail_level(best, level))
+    expected, state = expected_claims(known, tried, state, lambda some, now: gains(some, now.reduced, now, folds, tallies=tallies))
+    search = _Search(candidates, folds, tallies, tail_level(best, level), tuple(expected))
     claims, unknown, state = search.run(state)
-    return Naming(tuple(claims), tuple(unknown), search.threshold, best, reasons, tuple(candidates), state, folds, tallies)
+    return Naming(tuple(claims), tuple(unknown), search.threshold, best, reasons, tuple(candidates), state, folds, tallies, tuple(expected))
 
 
 def _null_best(
@@ -149,12 +155,13 @@ class _Search:
     folds: xr.DataArray
     tallies: Tallies
     threshold: float
+    expected: tuple[Claim, ...] = ()
 
     def run(self, start: State) -> tuple[list[Claim], list[Unknown], State]:
         """Name one effect after the other, look again at each with the others in, and see what is left."""
         chosen: list[Claim | Unknown] = []
         state = start
-        barred: set[str] = set()
+        barred = {key for one in self.expected for key in (one.parts[0].candidate.key, *self._counted(one))}
         rounds, lines = _ROUNDS, _LINES
         while rounds and lines:
             found = self._ranked(state, barred)
@@ -210,7 +217,7 @@ class _Search:
     def _pick(self, found: list[Found], state: State, chosen: Sequence[Claim | Unknown]) -> tuple[Claim | Unknown | None, set[str]] | None:
         """The next effect, or generic; None when nothing passes. Second: keys that are out of the race from now on."""
         parts = without_lines(by_key(found))
-        need = {key: self.threshold + form_error(several, chosen, share=FORM) for key, several in parts.items()}
+        need = {key: self.threshold + form_error(several, [*self.expected, *chosen], share=FORM) for key, several in parts.items()}
         for key in [key for key in parts if not key.startswith("~") and gain_sum(parts[key]) > need[key]]:
             parts[key] = possible(parts[key], state)
         ranked = sorted(parts, key=lambda key: -gain_sum(parts[key]))
@@ -298,7 +305,7 @@ class _Search:
 
     def _needed(self, claim: Claim, claims: dict[int, Claim]) -> float:
         """What a claim must gain beside the others, whichever was named first."""
-        others = [one for one in claims.values() if one is not claim]
+        others = [*self.expected, *(one for one in claims.values() if one is not claim)]
         return max(claim.threshold, self.threshold + form_error(claim.parts, others, share=FORM))
 
     def _finished(self, start: State, claim: Claim, chosen: Sequence[Claim | Unknown]) -> Claim:

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.views.cells import Array, Windows, cube_root_score, over_windows, values_of, view_dataset, window_set
 from gyrostab.diagnose.views.cross_axis import correlation_score
 from gyrostab.kernels.state_space import flicker_states, whiten
@@ -94,7 +95,9 @@ def _increments(residual: Array, there: NDArray[np.bool_], reduced: xr.Dataset, 
         variance = np.where(present, white[axis] + b**2 * faster, 1.0)
         series = residual[..., axis, :].reshape(-1, residual.shape[-1])
         columns = np.ascontiguousarray(np.where(present, series, 0.0).T)
-        made, _ = whiten(columns, variance, end - begin, present, k**2 / HOUR, b**2 * share, times)
+        known = known_wander(baseline, axis)
+        states = np.append(b**2 * share, known.square), np.append(times, known.time)
+        made, _ = whiten(columns, variance, end - begin, present, k**2 / HOUR + known.walk, *states)
         new[..., axis, :] = made.T.reshape(new[..., axis, :].shape)
     return new
 

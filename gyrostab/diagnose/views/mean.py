@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.gains.wander import known_wander, mean_share
 from gyrostab.diagnose.views.cells import Array, Windows, over_windows, values_of, view_dataset, window_set
 from gyrostab.kernels.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
 from gyrostab.kernels.state_space import flicker_states
@@ -103,7 +104,7 @@ def _matched(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array
 
 
 def mean_noise(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, present: Array) -> MeanNoise:
-    """Covariance of the block means of an axis: white, random walk and flicker of the baseline.
+    """Covariance of the block means of an axis: white, random walk and flicker of the baseline, and what else it knows to wander.
 
     Parameters
     ----------
@@ -120,13 +121,15 @@ def mean_noise(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, present: Ar
     step = np.diff((begin + end) / 2.0, append=end[-1])
     block, span = float(reduced.attrs["block_s"]), float(end[-1] - begin[0])
     share, times, white = flicker_states(block, span)
+    known = known_wander(baseline, axis)
+    slow, times = np.append(b**2 * share, known.square * mean_share(block, known.time)), np.append(times, known.time)
     decay = np.exp(-step[:, None] / times)
     variance = baseline["mean_variance"].transpose(..., "axis", "block").values[axis] + b**2 * white
     present = present & np.isfinite(variance) & (variance > 0)
     n = variance.size
     innovation, gain = np.empty(n), np.empty((n, times.size + 1))
     remaining = np.empty((n + 1, times.size + 1, times.size + 1))
-    filter_gains(variance, present, k**2 * step / HOUR, b**2 * share, decay, innovation, gain)
+    filter_gains(variance, present, (k**2 / HOUR + known.walk) * step, slow, decay, innovation, gain)
     remaining_information(innovation, gain, decay, remaining)
     return MeanNoise(present.astype(float), innovation, gain, decay, remaining)
 
