@@ -56,6 +56,26 @@ def test_it_is_told_where_they_stand(table, options):
         assert fitted.effect.fill == table.get("fill", "repeat")
 
 
+@pytest.mark.parametrize("fill", ["repeat", "zero"])
+def test_how_often_and_how_long_samples_were_held_is_told(fill):
+    """Held stretches drawn here, 40 of 6 samples each and 20 of 2."""
+    rng = np.random.default_rng(8)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    for number, first in enumerate(np.sort(rng.choice(np.arange(50, 14_900, 30), 60, replace=False))):
+        length = 6 if number < 40 else 2
+        noise[:, first : first + length] = noise[:, first - 1 : first] if fill == "repeat" else 0.0
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(reduced, 40)
+    found = fit_claims(name_effects(reduced, baseline, records), baseline)
+    assert [one.axes for one in found] == [("x",), ("y",), ("z",)]
+    hours = float(reduced["samples"].sel(axis="x").sum()) / 36_000.0
+    for one in found:
+        assert one.parameters["per_hour"].value == pytest.approx(60 / hours, rel=0.06)
+        assert one.parameters["length"].value == pytest.approx((40 * 6 + 20 * 2) / 60 / 10.0, rel=0.06)
+        for name, true in (("per_hour", 60 / hours), ("length", 0.467)):
+            assert one.parameters[name].low < true < one.parameters[name].high
+
+
 def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
     rng = np.random.default_rng(4)
     noise = SCATTER * rng.standard_normal((3, 15_000))

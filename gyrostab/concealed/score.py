@@ -16,6 +16,7 @@ Intervals = Sequence[Sequence[str]]
 
 #: Numbers of which only the size can be known: the sign of what several axes share is a matter of convention.
 _UNSIGNED = ("N",)
+_LAST_DIGITS = 1e-9  # of a number
 
 
 def _seconds(intervals: Intervals) -> list[tuple[float, float]]:
@@ -81,7 +82,8 @@ def _numbers(claim: Mapping[str, Any], effect: Mapping[str, Any]) -> list[dict[s
             low, high = sorted((turned * found["low"], turned * found["high"]))
             sure = found.get("value") is not None and found.get("stderr")
             pull = (turned * found["value"] - value) / found["stderr"] if sure else None
-            out.append({"parameter": name, "held": bool(low <= value <= high), "pull": pull})
+            last = _LAST_DIGITS * abs(value)  # what is exact may differ in the last digits
+            out.append({"parameter": name, "held": bool(low - last <= value <= high + last), "pull": pull})
     return out
 
 

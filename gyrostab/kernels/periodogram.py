@@ -81,25 +81,32 @@ def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
         Is filled with the values less their block's mean, 0 where missing.
     moments : ndarray, shape (block, 5)
         Is filled with mean, second and fourth central moment, smallest and largest value; NaN in an empty block.
-    counts : ndarray of int64, shape (block, 7)
+    counts : ndarray of int64, shape (block, 9)
         Is filled with the samples present, exact zeros, samples equal to the one before but for zeros, samples equal to the smallest
-        and to the largest value of the block, and how many of these two are equal to the one before and no zeros.
+        and to the largest value of the block, how many of these two are equal to the one before and no zeros, and the runs of samples
+        that are equal to the one before and no zeros, and of zeros.
     """
     size = x.shape[1]
     for b in range(x.shape[0]):
         row = x[b]
         first, low, high, total = np.nan, np.inf, -np.inf, 0.0
-        present, zeros, repeats = 0, 0, 0
+        present, zeros, repeats, runs, zero_runs = 0, 0, 0, 0, 0
+        repeated, zeroed = False, False
         for i in range(size):
             value = row[i]
             if value != value:
+                repeated, zeroed = False, False
                 continue
             if present == 0:
                 first = value
             present += 1
             total += value - first
             zeros += value == 0.0
-            repeats += i > 0 and value == row[i - 1] and value != 0.0
+            again = i > 0 and value == row[i - 1] and value != 0.0
+            repeats += again
+            runs += again and not repeated
+            zero_runs += value == 0.0 and not zeroed
+            repeated, zeroed = again, value == 0.0
             low, high = min(low, value), max(high, value)
         mean = first + total / max(present, 1)
         second, fourth = 0.0, 0.0
@@ -119,7 +126,7 @@ def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
                 lows_again += value == low
                 highs_again += value == high
         counts[b, 0], counts[b, 1], counts[b, 2], counts[b, 3], counts[b, 4] = present, zeros, repeats, lows, highs
-        counts[b, 5], counts[b, 6] = lows_again, highs_again
+        counts[b, 5], counts[b, 6], counts[b, 7], counts[b, 8] = lows_again, highs_again, runs, zero_runs
         moments[b, 0], moments[b, 1], moments[b, 2] = mean, second / max(present, 1), fourth / max(present, 1)
         moments[b, 3], moments[b, 4] = low, high
         if present == 0:

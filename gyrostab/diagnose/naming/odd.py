@@ -65,7 +65,11 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
         doubt = math.hypot(1.0 / math.sqrt(2.0 * many), law)
         return {"per_hour": (number / hours, number / hours * math.hypot(1.0 / error, law)), "size": (size, doubt * size)}
     if effect == "held_samples":
-        return {"per_hour": (count / hours, error / hours), "length": (1.0 / rate, 0.5 / rate)}
+        usual = usual if float(reduced["lattice"].sel(axis=axis)) > 0.0 else 0.0  # without a lattice chance makes none
+        count = max(float(reduced[mark].sel(axis=axis).sum()) - usual, 1.0)
+        runs = _held_runs(reduced, axis, mark, usual)
+        length = max(count / runs, 1.0) / rate  # of a geometric law: scattered by itself
+        return {"per_hour": (runs / hours, math.sqrt(runs) / hours), "length": (length, length / math.sqrt(runs))}
     share = min(count / samples, 0.999)
     if effect == "clipping":
         limit = spread * float(norm.isf(share / 2.0))
@@ -75,6 +79,16 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
         width = spread * float(norm.ppf(0.5 + share / 2.0))
         return {"width": (width, spread / (2.0 * float(norm.pdf(width / spread))) * error / samples)}
     return {}
+
+
+def _held_runs(reduced: xr.Dataset, axis: str, mark: str, usual: float) -> float:
+    """How often samples were held: runs of them, less those that a lattice makes by chance."""
+    own = {
+        name: float(reduced[name].sel(axis=axis).sum()) for name in ("adjacent", "repeats", "repeat_runs", "zeros", "zero_runs", "filled")
+    }
+    if mark == "filled":
+        return max(own["zero_runs"] * own["filled"] / max(own["zeros"], 1.0), 1.0)
+    return max(own["repeat_runs"] - usual * (1.0 - usual / max(own["adjacent"], 1.0)), 1.0)
 
 
 def _outliers(reduced: xr.Dataset, axis: str, spread: float) -> tuple[float, float, float] | None:

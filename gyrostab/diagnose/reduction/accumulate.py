@@ -50,7 +50,7 @@ class Accumulator:
         self.whole_neighbours = _neighbours(whole, self.weights)[0]
         bands = self.edges.size - 1
         self.moments = np.full((rows, blocks, 5), np.nan)
-        self.counts = np.zeros((rows, blocks, 7), np.int64)
+        self.counts = np.zeros((rows, blocks, 9), np.int64)
         self.together = np.zeros((self.axes, blocks), np.int64)
         self.histogram = np.zeros((self.axes, blocks, HISTOGRAM), np.uint32)
         self.peaks: list[list[Peaks]] = [[] for _ in range(self.axes)]

@@ -106,7 +106,8 @@ def reduce_log(
     -------
     xarray.Dataset
         By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``, ``neighbours``, ``adjacent``,
-        ``kurtosis``, ``peaks``, ``outliers``, ``repeats``, ``extremes``, ``zeros``, and of these ``stuck`` and ``filled``. By
+        ``kurtosis``, ``peaks``, ``outliers``, ``repeats`` and their ``repeat_runs``, ``extremes``, ``zeros`` and their ``zero_runs``,
+        and of these ``stuck`` and ``filled``. By
         ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``,
         ``cross_shape`` (pair, block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
         ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
@@ -181,6 +182,8 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
         "outliers": (plane, outliers, _named("samples that jump out alone, three times those beyond twice the limit", "1")),
         "adjacent": (plane, work.adjacent, _named("samples with another one right before them in the block", "1")),
         "repeats": (plane, _repeats(moments, counts), _named("samples equal to the one before, but for zeros and the ends", "1")),
+        "repeat_runs": (plane, counts[..., 7], _named("runs of samples equal to the one before, but for zeros", "1")),
+        "zero_runs": (plane, counts[..., 8], _named("runs of samples that are exactly 0", "1")),
         "extremes": (plane, _extremes(moments, counts), _named("samples equal to the smallest or largest of the record", "1")),
         "zeros": (plane, counts[..., 1], _named("samples that are exactly 0", "1")),
         "stuck": (plane, _stuck(moments, counts, filled), _named("zeros of one axis, within its range", "1")),
