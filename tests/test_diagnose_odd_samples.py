@@ -56,6 +56,17 @@ def test_it_is_told_where_they_stand(table, options):
         assert fitted.effect.fill == table.get("fill", "repeat")
 
 
+def test_a_pulse_that_comes_again_and_again_is_lines_and_no_spikes():
+    noise = SCATTER * np.random.default_rng(6).standard_normal((2, 15_000))
+    noise[0, ::37] += 8.0 * SCATTER
+    noise[1, np.random.default_rng(7).choice(15_000, 40, replace=False)] += 12.0 * SCATTER
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]))
+    baseline, records = nulls(reduced, 40)
+    found = {claim.effect: claim.axes for claim in name_effects(reduced, baseline, records).claims}
+    assert found["spectral_line"] == ("x",)
+    assert found["spikes"] == ("y",)
+
+
 @pytest.mark.parametrize("fill", ["repeat", "zero"])
 def test_how_often_and_how_long_samples_were_held_is_told(fill):
     """Held stretches drawn here, 40 of 6 samples each and 20 of 2."""

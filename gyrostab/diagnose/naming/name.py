@@ -25,7 +25,7 @@ from gyrostab.diagnose.naming.filters import without_slopes
 from gyrostab.diagnose.naming.layers import found_again, layers
 from gyrostab.diagnose.naming.levels import followed_first, renewed
 from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, lines_only, parts_of, tried_again, without_lines
-from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural
+from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural, without_pulses
 from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Effect
@@ -176,7 +176,7 @@ class _Search:
                 chosen = with_claim(chosen, one)
                 barred |= self._counted(one)
                 state = explain_away(state, list(one.parts))
-        chosen = self._pruned(start, chosen)
+        chosen = self._pruned(start, without_pulses(chosen))
         chosen, claims = self._settled(start, chosen)
         unknown = [one for one in chosen if isinstance(one, Unknown)]
         state = self._with(start, [*claims, *unknown])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,10 +12,11 @@ from gyrostab.diagnose.effects.candidates import LARGEST
 from gyrostab.diagnose.effects.cells import State
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.gains.levels import level_gains
+from gyrostab.diagnose.naming.claims import Claim, Unknown
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.registry import effects
 
-__all__ = ["PLAINER", "STRUCTURAL", "plainer_effect", "possible", "structural"]
+__all__ = ["PLAINER", "STRUCTURAL", "plainer_effect", "possible", "structural", "without_pulses"]
 
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 STRUCTURAL: dict[str, tuple[str, ...]] = {
@@ -29,6 +32,25 @@ _MOVING = 1.5  # times the expected power, from which on an axis moves
 _MORE, _FORM = 3.0, 0.01  # nats that further levels may gain, and of the first two's
 _LEAN, _SQUARE = 2e-2, 1e-5  # shares of the turning: of an axis that is across it, at most; and to which one can be squared up
 _LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
+
+
+def without_pulses(chosen: Sequence[Claim | Unknown]) -> list[Claim | Unknown]:
+    """What is chosen, without spikes on axes that have a comb of lines or a profile of the ramp.
+
+    A comb is a pulse that comes again and again, and what jumps out there is the pulse itself: wrong samples would make no lines.
+    """
+    lines: Counter[str] = Counter()
+    for part in (part for one in chosen for part in one.parts):
+        weight = {"line": 1, "phase_locked": _COMB}.get(part.candidate.view, 0)
+        lines.update(dict.fromkeys(part.row, weight))
+    out: list[Claim | Unknown] = []
+    for one in chosen:
+        if isinstance(one, Claim) and one.effect == "spikes":
+            kept = tuple(part for part in one.parts if lines[part.row[0]] < _COMB)
+            out += [replace(one, parts=kept, axes=tuple(part.row[0] for part in kept))] if kept else []
+        else:
+            out.append(one)
+    return out
 
 
 def possible(parts: Sequence[Part], state: State) -> list[Part]:
