@@ -39,7 +39,8 @@ def main() -> None:
     parser.add_argument("--whole", action="store_true", help="run the whole diagnosis (slow) in place of the gains")
     options = parser.parse_args()
     kinds = [(rate, lost) for rate in options.rates for lost in options.lost]
-    rows = [row for rate, lost in kinds for row in (whole if options.whole else ranks)(rate, lost, options)]
+    count = whole if options.whole else ranks
+    rows = [row for number, (rate, lost) in enumerate(kinds) for row in count(rate, lost, options, first=number * options.records)]
     if options.whole:
         head = (
             "| rate [Hz] | lost | records | named an effect | found a mismatch | 95 % bound of the share that is named | seconds a record |"
@@ -50,12 +51,15 @@ def main() -> None:
     print(f"{said}\n", head, "|" + "---|" * head.count(" | ") + "---|", *rows, sep="\n")
 
 
-def logs(rate: float, lost: float, count: int) -> Iterator[xr.Dataset]:
+def logs(rate: float, lost: float, seeds: range) -> Iterator[tuple[int, xr.Dataset]]:
     """Noise with random gaps."""
-    for seed in range(count):
+    for seed in seeds:
         log = simulate({"log": {"axes": ["x"]}, "noise": NOISE}, duration="1h", rate=rate, seed=seed).compute()
         gone = np.random.default_rng(seed).random(log.sizes["time"]) < lost
-        yield log.assign(rate=log["rate"].where(xr.DataArray(~gone, dims="time")).transpose("axis", "time").assign_attrs(log["rate"].attrs))
+        yield (
+            seed,
+            log.assign(rate=log["rate"].where(xr.DataArray(~gone, dims="time")).transpose("axis", "time").assign_attrs(log["rate"].attrs)),
+        )
 
 
 def candidates(reduced: xr.Dataset) -> dict[str, dict[str, list[np.ndarray]]]:
@@ -83,10 +87,10 @@ def candidates(reduced: xr.Dataset) -> dict[str, dict[str, list[np.ndarray]]]:
     return {"means": means, "powers": powers}
 
 
-def ranks(rate: float, lost: float, options: argparse.Namespace) -> list[str]:
-    """Rows of the table for one kind of record."""
+def ranks(rate: float, lost: float, options: argparse.Namespace, *, first: int) -> list[str]:
+    """Rows of the table for one kind of record; no two kinds have a record of the same noise."""
     found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
-    for seed, log in enumerate(logs(rate, lost, options.records)):
+    for seed, log in logs(rate, lost, range(first, first + options.records)):
         reduced = reduce_log(log)
         baseline = calibrate(reduced)
         chunks = list(null_records(reduced, baseline, count=options.nulls, rng=np.random.default_rng(seed), chunk=100))
@@ -108,12 +112,12 @@ def ranks(rate: float, lost: float, options: argparse.Namespace) -> list[str]:
     return rows
 
 
-def whole(rate: float, lost: float, options: argparse.Namespace) -> list[str]:
+def whole(rate: float, lost: float, options: argparse.Namespace, *, first: int) -> list[str]:
     """Row of the table of claims for one kind of record."""
     import gyrostab
 
     named, found, begin = 0, 0, time.monotonic()
-    for seed, log in enumerate(logs(rate, lost, options.records)):
+    for seed, log in logs(rate, lost, range(first, first + options.records)):
         told = gyrostab.diagnose(log, nulls=options.nulls, seed=seed)
         named += bool(told.effects)
         found += told.verdict != "no mismatch"
