@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,15 @@ from gyrostab.diagnose.effects.cells import State, in_place
 from gyrostab.diagnose.effects.explained import Part, explain_away
 from gyrostab.diagnose.effects.response import is_filter, response_of
 from gyrostab.diagnose.effects.search import gains
+from gyrostab.diagnose.effects.sizes import part_size
 from gyrostab.physics.registry import effects
 
-__all__ = ["filter_sizes", "without_slopes"]
+__all__ = ["filter_sizes", "on_all_axes", "without_slopes"]
 
 Array = NDArray[np.float64]
 _KEPT = 0.5  # of its gain, that a line must keep beside a filter
 _FINE, _ZOOMS = 21, 4
+_APART, _FORM = 6.0, 0.1  # nats by which axes may disagree by chance; and of the gain, what an error of the spectrum may leave
 
 
 def without_slopes(passing: list[str], parts: Mapping[str, list[Part]], state: State, folds: xr.DataArray) -> list[str]:
@@ -41,6 +44,21 @@ def without_slopes(passing: list[str], parts: Mapping[str, list[Part]], state: S
     before = {key: sum(max(part.gain, 0.0) for part in parts[key]) for key in lines}
     real = {key for key in lines if left.get(key, 0.0) > _KEPT * before[key]}
     return [key for key in passing if (key in real if key in lines else key not in filters or not real)]
+
+
+def on_all_axes(parts: Sequence[Part], state: State) -> bool:
+    """Whether one filter suits all axes: they pass the same logger, so that it takes the same share of the noise of each.
+
+    The share of the strongest part is fitted on every axis, also on those that do not show it, and once for all of them.
+    """
+    shown = [part for part in parts if is_filter(part.candidate.view, part.variant)]
+    if not shown:
+        return True
+    first = max(shown, key=lambda part: part.gain)
+    share, error = np.array([part_size(replace(first, row=(axis,)), state) for axis in state.axes]).T
+    weight = error**-2.0
+    apart = 0.5 * float((weight * (share - (weight * share).sum() / weight.sum()) ** 2).sum())
+    return apart <= _APART + _FORM * sum(max(part.gain, 0.0) for part in shown)
 
 
 def _candidates(parts: Mapping[str, list[Part]], keys: Iterable[str]) -> list[Candidate]:
