@@ -14,6 +14,7 @@ from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.gains.levels import level_gains
 from gyrostab.diagnose.naming.claims import Claim, Unknown
 from gyrostab.diagnose.naming.filters import on_all_axes
+from gyrostab.diagnose.naming.jumps import sudden
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.registry import effects
 
@@ -56,7 +57,7 @@ def without_pulses(chosen: Sequence[Claim | Unknown]) -> list[Claim | Unknown]:
 
 def possible(parts: Sequence[Part], state: State) -> list[Part]:
     """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not."""
-    return [part for part in parts if _possible(part, state)] if on_all_axes(parts, state) else []
+    return [part for part in parts if _possible(part, state)] if on_all_axes(parts, state) and sudden(parts, state) else []
 
 
 def plainer_effect(parts: Sequence[Part], state: State) -> str | None:
