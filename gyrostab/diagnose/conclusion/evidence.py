@@ -41,8 +41,8 @@ def held_out(reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain:
         block, band). A callable gets the mask of the blocks that may be used, and gives the baseline fitted to them; a Dataset is
         taken as it is, and what comes of it is held out only if it was fitted elsewhere.
     more_gain : float
-        Held-out gain of what is in neither means nor powers nor cross-spectra, which is added [nats]: counts of odd samples. Lines are
-        in the powers of their bands already, and would count twice.
+        Held-out gain of what is in neither means nor powers nor cross-spectra, which is added [nats]: counts of odd samples, waves of known
+        course, biases of two levels. Lines are in the powers of their bands already, and would count twice.
 
     Returns
     -------
