@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
+from scipy.signal import butter, lfilter, sosfilt
 
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.effects.candidates import effect_candidates
 from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.response import is_filter
 from gyrostab.diagnose.effects.search import gains
 from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.naming.filters import on_all_axes
+from gyrostab.diagnose.naming.filters import filter_sizes, on_all_axes
 from gyrostab.diagnose.naming.parts import by_key, gain_sum
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.diagnose.reduction.reduced import reduce_log
@@ -32,3 +36,30 @@ def test_a_filter_that_other_axes_deny_is_none_of_the_logger(late, one_filter):
     assert gain_sum(parts) > 10.0
     assert on_all_axes(parts, state) == one_filter
     assert possible(parts, state) == (parts if one_filter else [])
+
+
+def test_a_cutoff_that_the_record_does_not_tell_has_an_interval_of_all_that_suit() -> None:
+    """Samples with a little memory are a picked low-pass beyond half the rate; with free quantization noise one far down does the same."""
+    share, rate = 0.05, 10.0
+    raw = np.random.default_rng(2).standard_normal((2, 12_000))
+    low, high = _cutoff(make_log(lfilter([1.0 - share], [1.0, -share], raw, axis=1), rate=rate, unit="deg/h"))
+    assert low <= -np.log(share) * rate / (2.0 * np.pi) <= high
+    assert high > 3.0 * low
+
+
+def test_a_cutoff_that_the_record_tells_keeps_its_narrow_interval() -> None:
+    raw = np.random.default_rng(3).standard_normal((2, 120_000))
+    low, high = _cutoff(make_log(sosfilt(butter(4, 2.0, fs=100.0, output="sos"), raw, axis=1)[:, ::10], rate=10.0, unit="deg/h"))
+    assert (low + high) / 2.0 == pytest.approx(2.0, rel=0.05)
+    assert high < 1.2 * low
+
+
+def _cutoff(log: xr.Dataset) -> tuple[float, float]:
+    """95 % interval of the cutoff of a filter on all axes of a record."""
+    reduced = reduce_log(log)
+    baseline = calibrate(reduced)
+    candidate = next(one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == "logger_filter")
+    variant = next(one for one in candidate.variants if is_filter("power", one))
+    parts = [Part(candidate, variant, (str(axis),), 50.0) for axis in reduced["axis"].values]
+    mean, error, *ends = filter_sizes(parts, begin_state(reduced, baseline))[0]["cutoff"]
+    return (ends[0], ends[1]) if ends else (mean - 1.96 * error, mean + 1.96 * error)

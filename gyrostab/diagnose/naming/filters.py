@@ -25,6 +25,7 @@ __all__ = ["filter_sizes", "on_all_axes", "without_slopes"]
 Array = NDArray[np.float64]
 _KEPT = 0.5  # of its gain, that a line must keep beside a filter
 _FINE, _ZOOMS = 21, 4
+_NEXT, _ELSEWHERE, _TAIL, _TWO_SIDED = 0.25, 0.02, 0.025, 1.959964  # reach of a place on the grid; shares of what lies elsewhere
 _APART, _FORM = 6.0, 0.1  # nats by which axes may disagree by chance; and of the gain, what an error of the spectrum may leave
 
 
@@ -65,13 +66,13 @@ def _candidates(parts: Mapping[str, list[Part]], keys: Iterable[str]) -> list[Ca
     return [parts[key][0].candidate for key in keys]
 
 
-def filter_sizes(parts: Sequence[Part], state: State) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
+def filter_sizes(parts: Sequence[Part], state: State) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
     """Cutoff or length of a filter, and the words beside it, by the likelihood of the powers of all its axes with free noise.
 
     Returns
     -------
-    sizes : dict of str to (float, float)
-        The one parameter that is measured, with its error.
+    sizes : dict of str to (float, float) or (float, float, float, float)
+        The one parameter that is measured, with its error; and with the ends of its 95 % interval where several places suit.
     others : dict of str to float
         Order, and what the samples are.
     """
@@ -83,13 +84,15 @@ def filter_sizes(parts: Sequence[Part], state: State) -> tuple[dict[str, tuple[f
         return sum(_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
 
     family = [one.values for one in parts[0].candidate.variants if is_filter("power", one)]
-    best = max(family, key=likelihood)
+    log = [likelihood(one) for one in family]
+    best = family[int(np.argmax(log))]
     name = "cutoff" if best["cutoff"] else "length"
     others = {key: float(value) for key, value in best.items() if key != name}
     if name == "length" and best["instrument"] == 1.0:
         return {name: (float(best[name]), 0.0)}, others  # a count of samples
     alike = sorted({float(one[name]) for one in family if all(one[key] == best[key] for key in others)})
-    return {name: _zoomed(alike, float(best[name]), lambda value: likelihood({**best, name: value}))}, others
+    sharp = _zoomed(alike, float(best[name]), lambda value: likelihood({**best, name: value}))
+    return {name: _of_all(sharp, [(float(one[name]), each) for one, each in zip(family, log, strict=True) if one[name]])}, others
 
 
 def _zoomed(grid: Sequence[float], start: float, likelihood: Callable[[float], float]) -> tuple[float, float]:
@@ -106,6 +109,31 @@ def _zoomed(grid: Sequence[float], start: float, likelihood: Callable[[float], f
         sd = max(float(np.sqrt(weight @ (values - mean) ** 2)), 0.3 * (values[1] - values[0]))
         low, high = max(mean - 5.0 * sd, low), min(mean + 5.0 * sd, high)
     return mean, sd
+
+
+def _of_all(sharp: tuple[float, float], tried: Sequence[tuple[float, float]]) -> tuple[float, ...]:
+    """A parameter with its error; and with the ends of its 95 % interval where more of the grid than one place suits the record.
+
+    With free noise that rises with frequency a low-pass far down does what a weak one far up does; and other orders, or samples that are
+    picked, have cutoffs of their own.
+
+    Parameters
+    ----------
+    sharp : (float, float)
+        Mean and standard deviation about the best place.
+    tried : sequence of (float, float)
+        Values of all filters of the family, evenly spread in their logarithm, and logarithms of their likelihoods.
+    """
+    value, log = (np.array(one) for one in zip(*sorted(tried), strict=True))
+    share = np.exp(log - np.logaddexp.reduce(log))
+    mean, sd = sharp
+    near = np.abs(np.log(value / mean)) <= max(_NEXT, 2.0 * sd / mean)
+    if share[~near].sum() < _ELSEWHERE:
+        return sharp
+    below, above = share.cumsum(), share[::-1].cumsum()[::-1]
+    low = min(float(value[below >= _TAIL].min()), mean - _TWO_SIDED * sd)
+    high = max(float(value[above >= _TAIL].max()), mean + _TWO_SIDED * sd)
+    return mean, (high - low) / (2.0 * _TWO_SIDED), low, high
 
 
 def _fit(axis: str, state: State) -> tuple[Fit, Array]:
