@@ -45,6 +45,7 @@ from gyrostab.diagnose.naming.claims import Claim
 from gyrostab.diagnose.naming.levels import without_levels
 from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
 from gyrostab.diagnose.naming.name import Naming, name_effects
+from gyrostab.diagnose.naming.waves import without_waves
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import Effect
@@ -270,6 +271,7 @@ def _concluded(
     after = predicted(naming, noise) if naming.claims else before
 
     told, hopping = without_levels(raw)
+    told, waving = without_waves(told)
 
     def trained(known: NDArray[np.bool_]) -> xr.Dataset:
         own = recalibrate(told, baseline, first, known)
@@ -279,7 +281,7 @@ def _concluded(
     odd = sum(part.gain for part in parts if part.candidate.view == "marks")  # no other number has them
     clean = without_odd(reduced, [*parts, *(part for claim in told.expected for part in claim.parts)])
     start = partial(expected_baseline, told, baseline) if told.expected else baseline
-    held = held_out(clean, start, trained if told.claims else start, more_gain=odd + hopping)
+    held = held_out(clean, start, trained if told.claims else start, more_gain=odd + hopping + waving)
 
     def without(left_out: Sequence[Claim]) -> xr.Dataset:
         return predicted(naming, noise, left_out=left_out)
