@@ -148,6 +148,9 @@ def _diagnose(
         reduced = reduce_log(log.sel(axis=alive), block=block, restart_gap=restart_gap, progress=progress)
         given = given.sel(axis=alive) if isinstance(given, xr.Dataset) else given
 
+    def still(reduced: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
+        return _still_lines(log.sel(axis=alive), reduced, known, restart_gap, progress)
+
     def compared(reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset, Naming, NullScores]:
         progress("calibrating", 0)
         baseline = _baseline(reduced, given, quiet, restart_gap, progress)
@@ -163,9 +166,8 @@ def _diagnose(
         known = _known_apart(baseline, given)
         naming = name_effects(seen, baseline, records(), level=level / 2.0, seed=seed, known=known, progress=progress)
         before = expected_baseline(naming, baseline)
-        found = locate(
-            without_expected(seen, baseline, naming.expected), before, null, level=level / 2.0
-        )  # the other half is for the names
+        apart = without_expected(still(seen, before) if naming.expected else seen, baseline, naming.expected)
+        found = locate(apart, before, null, level=level / 2.0)  # the other half is for the names
         return reduced, baseline, unexpected(found, naming.expected, seen, before, null, level=level / 2.0), naming, null
 
     reduced, baseline, found, naming, null = compared(reduced)
@@ -175,7 +177,7 @@ def _diagnose(
         reduced, baseline, found, naming, null = compared(reduced)
     progress("fitting", 0)
     own = given if isinstance(given, Model) else None
-    return _concluded(reduced, baseline, found, naming, null, level=level, given=own, begun=begun)
+    return _concluded(reduced, baseline, found, naming, null, still, level=level, given=own, begun=begun)
 
 
 def _check_options(nulls: int, level: float, seed: int) -> None:
@@ -246,6 +248,19 @@ def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -
     return recall
 
 
+def _still_lines(log: xr.Dataset, reduced: xr.Dataset, known: xr.Dataset, restart_gap: Any, progress: Stage) -> xr.Dataset:
+    """The record with the line spectra of the blocks in which nothing that is known moves; the log is read once more where something does.
+
+    A step within a block has the spectrum of a step, and a part of the record has only one for all its blocks.
+    """
+    there = np.isfinite(reduced["power"].transpose("axis", "block", "band").values).any(axis=-1)
+    moving = known_motion(reduced, known)
+    if not (moving & there).any():
+        return reduced
+    calm = without_motion(log, reduced, moving | ~there, restart_gap=restart_gap, progress=progress)
+    return without_known_lines(reduced.assign({name: calm[name] for name in ("line_power", "line_weight")}), known)
+
+
 def _known_apart(baseline: xr.Dataset, given: xr.Dataset | Model | None) -> list[Effect]:
     """Effects of the model that its baseline leaves out, in part or whole."""
     return [one for one in given.effects if one.name in baseline.attrs["left_out"]] if isinstance(given, Model) else []
@@ -257,6 +272,7 @@ def _concluded(
     found: xr.Dataset,
     naming: Naming,
     null: NullScores,
+    still: Callable[[xr.Dataset, xr.Dataset], xr.Dataset],
     *,
     level: float,
     given: Model | None,
@@ -286,7 +302,8 @@ def _concluded(
     def without(left_out: Sequence[Claim]) -> xr.Dataset:
         return predicted(naming, noise, left_out=left_out)
 
-    explained = explanations(found, naming.claims, reduced, after, null, level=level / 2.0, without=without)
+    lines = still(reduced, after) if naming.claims and (found["view"] == "spectrum").any() else None
+    explained = explanations(found, naming.claims, reduced, after, null, level=level / 2.0, without=without, still=lines)
     mismatches = mismatch_tables(found, reduced, explained)
     mismatches += claim_tables(naming, reduced, mismatches)
     mismatches += unknown_tables(naming, reduced, mismatches)

@@ -23,7 +23,7 @@ from gyrostab.physics.logger import LoggerFilter
 from gyrostab.physics.prediction import Prediction
 from gyrostab.simulate.model import Model
 
-__all__ = ["Known", "drivers_of", "evenness", "known_effects", "known_motion", "without_known_lines"]
+__all__ = ["Known", "drivers_of", "evenness", "known_effects", "known_motion", "without_known_lines", "without_known_motion"]
 
 Array = NDArray[np.float64]
 _REACH, _BETWEEN = 100, 4  # ordinates on either side that a line leaks into; places of it between one and the next, on either side
@@ -144,6 +144,25 @@ def known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]
     noise = baseline["spectrum"].transpose("axis", "block", "band").values[..., 0]
     moving = moved**2 * float(reduced.attrs["block_s"]) > _MOVES * noise
     return np.asarray(moving & (moving.mean(axis=1, keepdims=True) <= _USUAL))
+
+
+def without_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+    """The record without what blocks say of their inside where what is known of an axis moves: powers, kurtosis, and what axes share there.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+    """
+    moving = known_motion(reduced, baseline)
+    if not moving.any():
+        return reduced
+    still = xr.DataArray(~moving, dims=("axis", "block"))
+    out = reduced.assign({name: reduced[name].where(still) for name in ("power", "kurtosis") if name in reduced})
+    if "cross" not in reduced:
+        return out
+    axes = [str(axis) for axis in reduced["axis"].values]
+    both = [still.values[[axes.index(axis) for axis in pair]].all(axis=0) for pair in pair_rows(reduced)]
+    return out.assign(cross=reduced["cross"].where(xr.DataArray(np.reshape(both, (-1, moving.shape[1])), dims=("pair", "block"))))
 
 
 def _known_lines(reduced: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array) -> dict[str, Array]:

@@ -10,8 +10,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.calibration.known import known_motion
 from gyrostab.diagnose.conclusion.weighing import Scores, left_of, needed, view_scores
-from gyrostab.diagnose.effects.explained import Part, odd_blocks
+from gyrostab.diagnose.effects.explained import Part, mean_columns, odd_blocks
 from gyrostab.diagnose.locating.null_scores import NullScores
 from gyrostab.diagnose.naming.name import Claim
 
@@ -20,7 +21,7 @@ __all__ = ["acting", "explanations", "spans", "unexpected"]
 Array = NDArray[np.float64]
 #: Where an effect shows -> views of mismatches that it can explain; "model" ones are looked at again with the effect in the model.
 _SHOWS: dict[str, tuple[str, ...]] = {
-    "mean": ("mean", "restart", "davar", "distribution", "cross_axis"),
+    "mean": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
     "power": ("davar", "spectrum", "distribution"),
     "cross": ("cross_axis", "davar"),
     "marks": ("distribution", "davar", "spectrum"),
@@ -29,7 +30,7 @@ _SHOWS: dict[str, tuple[str, ...]] = {
     "phase_locked": ("spectrum", "davar", "distribution", "mean"),
     "transfer": ("davar", "cross_axis", "spectrum", "mean", "distribution"),
     "wander": ("mean", "davar", "restart", "cross_axis"),
-    "levels": ("mean", "restart", "davar", "distribution", "cross_axis"),
+    "levels": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
 }
 _MODELLED = ("mean", "power", "cross", "wander", "levels")  # parts that the baseline with the effects holds
 _ACTS = 0.1  # of its largest, that a contribution counts as there
@@ -38,6 +39,8 @@ _MEETS = 0.3  # of the shorter of effect and mismatch
 _MOST_SPANS = 6
 _BESIDE, _SHARP = 3, 0.02  # lines beside a strong one, and share of its frequency, that belong to it
 _BUMP, _WIDE = 0.371, 4.0
+_MOVES = ("mean", "levels")  # parts that may move the rate within a block, which is power there and at the lowest lines
+_MOVED = 0.1  # of the largest step from block to block
 
 
 def acting(claim: Claim, reduced: xr.Dataset) -> NDArray[np.bool_]:
@@ -105,12 +108,14 @@ def explanations(
     *,
     level: float,
     without: Callable[[Sequence[Claim]], xr.Dataset] | None = None,
+    still: xr.Dataset | None = None,
 ) -> list[list[str]]:
     """Effects that explain each mismatch.
 
     An effect explains it when it acts on one of its axes at its time and can show in its view; and where the baseline with the effects
     holds what it does there, when the mismatch is gone with that baseline, or nearly so, and takes this effect for it. A mismatch of the
-    mean may also stand before or after what an effect does, where that is what the mean differs from.
+    mean may also stand before or after what an effect does, where that is what the mean differs from. Where an effect moves the rate
+    within blocks, these blocks have more power than the noise, and the lines more at their low end.
 
     Parameters
     ----------
@@ -126,6 +131,8 @@ def explanations(
     without : callable, optional
         Gives the baseline with the effects but for some of them, at the sizes that they have beside these. Without it every effect that
         is in the place of a mismatch is said to explain it.
+    still : xarray.Dataset, optional
+        Has the line spectra of the recording without the blocks in which an effect moves the rate.
 
     Returns
     -------
@@ -133,28 +140,35 @@ def explanations(
         Names, for each mismatch.
     """
     boxes = [{str(name): found[name].values[number] for name in found.data_vars} for number in range(found.sizes["mismatch"])]
-    scores = view_scores(reduced, after, null, boxes, claims)
+    scores = view_scores(reduced, after, null, boxes, claims, still=still)
     known: dict[tuple[int, ...], Scores] = {(): scores}
 
     def left(box: Mapping[str, Any], out: Sequence[Claim]) -> tuple[float, float]:
         chosen = tuple(number for number, claim in enumerate(claims) if any(claim is one for one in out))
         if chosen not in known and without is not None:
             rest = [claim for number, claim in enumerate(claims) if number not in chosen]
-            known[chosen] = view_scores(reduced, without(out), null, boxes, rest)
+            known[chosen] = view_scores(reduced, without(out), null, boxes, rest, still=still)
         return left_of(box, known[chosen], null, level)
 
     when = [_reach(claim, reduced) for claim in claims]
+    moves = [_moves(claim, reduced, after) for claim in claims]
     told = []
     for box in boxes:
         score, limit = left_of(box, scores, null, level)
         shown = []
-        for claim, its_time in zip(claims, when, strict=True):
+        for claim, its_time, its_moves in zip(claims, when, moves, strict=True):
+            moved = _is_inside(box, reduced) and any(_overlap(box, span) > 0.0 for span in its_moves)
             parts = [part for part in claim.parts if _can_show(part, box, reduced)]
+            parts = [part for part in parts if moved or part.candidate.view not in _MOVES or box["view"] != "spectrum"]
             if not parts or not set(str(box["axes"]).split()) & set(claim.axes):
                 continue
             if score >= limit and {part.candidate.view for part in parts} <= _modelled(claim, box):
                 continue
-            if any(_meet(box, span) for span in its_time) or (without is not None and _beside(box, parts, partial(left, box, (claim,)))):
+            if (
+                moved
+                or any(_meet(box, span) for span in its_time)
+                or (without is not None and _beside(box, parts, partial(left, box, (claim,))))
+            ):
                 shown.append((claim, parts))
         several = without is not None and score < limit
         kept = needed(box, shown, partial(left, box)) if several else [claim for claim, _ in shown]
@@ -235,5 +249,26 @@ def _reach(claim: Claim, reduced: xr.Dataset) -> list[tuple[float, float]]:
 
 
 def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
-    shared = min(box["end"], span[1]) - max(box["begin"], span[0])
-    return bool(shared >= _MEETS * min(box["end"] - box["begin"], span[1] - span[0]))
+    return _overlap(box, span) >= _MEETS * min(float(box["end"] - box["begin"]), span[1] - span[0])
+
+
+def _overlap(box: Mapping[str, Any], span: tuple[float, float]) -> float:
+    return float(min(box["end"], span[1]) - max(box["begin"], span[0]))
+
+
+def _is_inside(box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
+    """Whether a mismatch is of the inside of blocks, and not of their means."""
+    return str(box["view"]) in ("spectrum", "distribution") or float(box["tau_max_s"]) < float(reduced.attrs["block_s"])
+
+
+def _moves(claim: Claim, reduced: xr.Dataset, after: xr.Dataset) -> list[tuple[float, float]]:
+    """Blocks [s] in which an effect moves the rate of an axis too fast for what is said of their inside."""
+    axes, moving = [str(axis) for axis in reduced["axis"].values], known_motion(reduced, after)
+    there = np.zeros(reduced.sizes["block"], np.bool_)
+    for part in (part for part in claim.parts if part.candidate.view in _MOVES and part.variant.design.size):
+        row = axes.index(part.row[0])
+        for column in mean_columns(part.variant, row):
+            step = np.abs(np.diff(np.nan_to_num(column)))
+            far = step > _MOVED * step.max(initial=0.0)
+            there |= moving[row] & (np.append(far, False) | np.append(False, far))
+    return [(float(reduced["begin"].values[block]), float(reduced["end"].values[block])) for block in np.flatnonzero(there)]

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.calibration.known import without_known_motion
 from gyrostab.diagnose.effects.cells import pair_rows
 from gyrostab.diagnose.effects.explained import Part, without_odd, without_turns
 from gyrostab.diagnose.effects.response import is_filter
@@ -30,17 +31,33 @@ _WEIGHED: dict[str, tuple[str, ...]] = {
     "cross_axis": ("mean", "levels", "cross", "line"),
     "distribution": ("power",),
 }
+_OF_LINES = ("spectrum", "gliding")  # views of the spectrum at full resolution
 _LEFT = 0.3  # of a mismatch, that an error of the form may leave
 _FAIR = 0.5  # of an equal share
 
 
-def view_scores(reduced: xr.Dataset, after: xr.Dataset, null: NullScores, boxes: Sequence[Box], claims: Iterable[Claim] = ()) -> Scores:
-    """Views of the recording against a baseline with effects in it; what is said of blocks leaves out those of odd samples of `claims`."""
+def view_scores(
+    reduced: xr.Dataset,
+    after: xr.Dataset,
+    null: NullScores,
+    boxes: Sequence[Box],
+    claims: Iterable[Claim] = (),
+    *,
+    still: xr.Dataset | None = None,
+) -> Scores:
+    """Views of the recording against a baseline with effects in it.
+
+    What is said of blocks leaves out those of odd samples of `claims`, and what is said of their inside those in which an effect moves
+    the rate; so do the lines of `still`, which are those of `reduced` by default.
+    """
     out = []
+    reduced = without_known_motion(reduced, after)
     after = _with_shared_lines(reduced, after, claims := list(claims))
     seen = without_odd(reduced, [part for claim in claims for part in claim.parts])
     turns_left_out = without_turns(reduced, after["spectrum"].transpose("axis", "block", "band").values)
     special = {"distribution": turns_left_out, "restless": levelled(seen, after, louder(boxes))}
+    if still is not None:
+        special |= dict.fromkeys(_OF_LINES, seen.assign({name: still[name] for name in ("line_power", "line_weight")}))
     for name, score in VIEWS.items():
         scores = score(special.get(name, seen), after) if name in null.views else None
         if scores is not None:
