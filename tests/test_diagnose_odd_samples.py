@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.modelling.odd_power import with_odd_power
+from gyrostab.diagnose.modelling.predict import predicted
+from gyrostab.diagnose.modelling.recalibrate import recalibrate
 from gyrostab.diagnose.modelling.refit import fit_claims
 from gyrostab.diagnose.naming.name import Naming, name_effects
 from gyrostab.diagnose.reduction.reduced import reduce_log
@@ -133,6 +136,23 @@ def test_spikes_of_six_deviations_are_named_and_counted():
     number = fitted.parameters["per_hour"].value * 15_000 / 36_000
     assert 10 < number < 40
     assert 0.5 < fitted.parameters["size"].value / (6.0 * SCATTER) < 2.0
+
+
+def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_powers_of_the_model():
+    rng = np.random.default_rng(11)
+    hit = rng.random((1, 15_000)) < 0.009
+    noise = SCATTER * (rng.standard_normal((1, 15_000)) + 70.0 * rng.standard_normal((1, 15_000)) * hit)
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
+    assert (reduced["peaks"] > 0).mean() > 0.6
+    baseline, records = nulls(reduced, 40)
+    (fitted,) = fit_claims(found := name_effects(reduced, baseline, records), baseline)
+    size, number = fitted.parameters["size"], fitted.parameters["per_hour"]
+    assert size.low < 70.0 * SCATTER < size.high
+    assert number.low < 0.009 * 36_000 < number.high
+    clean = predicted(found, recalibrate(found, baseline, [fitted]))
+    whole = with_odd_power(clean, reduced, [fitted])["spectrum"].mean()
+    assert float(whole) == pytest.approx(float(reduced["power"].mean()), rel=0.4)
+    assert float(clean["spectrum"].mean()) < 0.1 * float(whole)
 
 
 def test_bursts_of_noise_shorter_than_a_block_have_no_spikes():

@@ -38,6 +38,7 @@ from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import NullScores, null_scores
 from gyrostab.diagnose.modelling.expected import expected_baseline, fit_expected, without_expected
 from gyrostab.diagnose.modelling.limits import limits
+from gyrostab.diagnose.modelling.odd_power import with_odd_power
 from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.modelling.refit import fit_claims
@@ -309,10 +310,11 @@ def _concluded(
     mismatches += unknown_tables(naming, reduced, mismatches)
     mismatches += motion_tables(naming.claims, reduced, mismatches)
     unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
+    expected = fit_expected(naming, baseline)
     content = {
         "schema": SCHEMA,
         "recording": recording_table(reduced),
-        "baseline": baseline_table(baseline, fit_expected(naming, baseline)),
+        "baseline": baseline_table(baseline, expected),
         "verdict": verdict(mismatches, naming.claims, unexplained),
         "false_alarm_level": level,
         "mismatches": mismatches,
@@ -322,6 +324,7 @@ def _concluded(
         "held_out": {name: held[name] for name in HELD_OUT},
         "seconds": round(time.perf_counter() - begun, 3),
     }
+    before, after = with_odd_power(before, reduced, expected), with_odd_power(after, reduced, [*expected, *fitted])
     surfaces = surfaces_with_blocks(make_surfaces(reduced, before, after), reduced, before, after)
     diagnosis = Diagnosis(plain(content), surfaces, model_tables(noise, fitted, given))
     check_diagnosis(diagnosis.content)

@@ -24,7 +24,7 @@ _SHOWS: dict[str, tuple[str, ...]] = {
     "mean": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
     "power": ("davar", "spectrum", "distribution"),
     "cross": ("cross_axis", "davar"),
-    "marks": ("distribution", "davar", "spectrum"),
+    "marks": ("distribution", "davar", "spectrum", "cross_axis"),
     "line": ("spectrum", "davar", "distribution", "cross_axis"),
     "order": ("spectrum", "davar", "mean", "distribution", "cross_axis"),
     "phase_locked": ("spectrum", "davar", "distribution", "mean"),
@@ -214,7 +214,7 @@ def _beside(box: Mapping[str, Any], parts: Sequence[Part], left: Callable[[], tu
 
 def _modelled(claim: Claim, box: Mapping[str, Any]) -> set[str]:
     """Parts that must take the mismatch away; that several axes wander as one is in no model, and what wanders on them may do it."""
-    held = {*_MODELLED, "line"} if box["view"] == "cross_axis" else set(_MODELLED)
+    held = {*_MODELLED, "line", "marks"} if box["view"] == "cross_axis" else set(_MODELLED)
     wanders = str(box["what"]) == "slow" and len(set(str(box["axes"]).split()) & set(claim.axes)) > 1
     return held - ({"wander"} if wanders else set())
 

@@ -28,7 +28,7 @@ _WEIGHED: dict[str, tuple[str, ...]] = {
     "davar": ("mean", "levels", "power", "cross", "marks", "line", "order", "phase_locked", "transfer"),
     "mean": ("mean", "levels", "marks"),
     "restart": ("mean", "levels", "marks"),
-    "cross_axis": ("mean", "levels", "cross", "line"),
+    "cross_axis": ("mean", "levels", "cross", "line", "marks"),
     "distribution": ("power",),
 }
 _OF_LINES = ("spectrum", "gliding")  # views of the spectrum at full resolution

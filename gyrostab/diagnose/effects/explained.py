@@ -261,8 +261,8 @@ def _marks(state: State, part: Part) -> State:
     for variable in ("mean", "power"):
         reduced[variable] = reduced[variable].where(keep | ~here)
     if "cross" in reduced:
-        touched = xr.DataArray(np.array([axis in pair for pair in pair_rows(reduced)], dtype=bool), dims="pair")
-        reduced["cross"] = reduced["cross"].where(keep | ~touched)
+        rows = np.array([one == axis for one in state.axes])
+        reduced["cross"] = _cross_without(reduced, odd & rows[:, None])
     return replace(state, reduced=reduced)
 
 
@@ -285,8 +285,18 @@ def without_odd(reduced: xr.Dataset, parts: Iterable[Part]) -> xr.Dataset:
     odd = np.zeros((len(axes), reduced.sizes["block"]), np.bool_)
     for part in (part for part in parts if part.candidate.view == "marks"):
         odd[axes.index(part.row[0])] |= odd_blocks(part, reduced)
+    if not odd.any():
+        return reduced
     there = xr.DataArray(~odd, dims=("axis", "block"))
-    return reduced.assign(mean=reduced["mean"].where(there), power=reduced["power"].where(there)) if odd.any() else reduced
+    left = reduced.assign(mean=reduced["mean"].where(there), power=reduced["power"].where(there))
+    return left.assign(cross=_cross_without(reduced, odd)) if "cross" in reduced else left
+
+
+def _cross_without(reduced: xr.Dataset, odd: NDArray[np.bool_]) -> xr.DataArray:
+    """Covariances of the pairs of axes without the blocks that are odd on either, (axis, block)."""
+    axes = [str(axis) for axis in reduced["axis"].values]
+    touched = [odd[axes.index(one)] | odd[axes.index(other)] for one, other in pair_rows(reduced)]
+    return reduced["cross"].where(~xr.DataArray(np.array(touched), dims=("pair", "block")))
 
 
 _TAKERS = {

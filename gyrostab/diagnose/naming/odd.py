@@ -14,6 +14,7 @@ __all__ = ["line_size", "mark_sizes"]
 
 _DEPARTURE = 1.08  # of white noise from the median of eight samples beside each, in its own deviations
 _USUAL = 0.2  # of the usual variance of a block, by which that of one may be higher by chance
+_CALM = 5  # blocks without an outlier that tell how loud the noise is
 _LAW = 0.1  # of the number and the size of outliers, by which the law of their sizes may be another; at least half of those not seen
 Pair = tuple[float, float]
 
@@ -56,7 +57,7 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
     if effect == "spikes":
         count = max(float(reduced["peaks"].sel(axis=axis).where(reduced[mark].sel(axis=axis) > 0).sum()), 1.0)
         error = math.sqrt(count)
-        told = _outliers(reduced, axis, spread)
+        told = _outliers(reduced, axis)
         if told is None:  # no block was steady enough to have a kurtosis
             return {"per_hour": (count / hours, error / hours)}
         seen, size, many = told
@@ -91,8 +92,8 @@ def _held_runs(reduced: xr.Dataset, axis: str, mark: str, usual: float) -> float
     return max(own["repeat_runs"] - usual * (1.0 - usual / max(own["adjacent"], 1.0)), 1.0)
 
 
-def _outliers(reduced: xr.Dataset, axis: str, spread: float) -> tuple[float, float, float] | None:
-    """Share of outliers that is seen, their rms size, and outliers told by; None where nothing tells.
+def _outliers(reduced: xr.Dataset, axis: str) -> tuple[float, float, float] | None:
+    """Share of outliers that is seen, their rms size [degree hour-1], and outliers told by; None where nothing tells.
 
     Of a block of n samples of the deviation s with m outliers of the square u s^2 each, a = m u / n, the fourth moment over the squared
     second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2, which is solved for a. Only the larger ones of a normal law are seen,
@@ -111,14 +112,16 @@ def _outliers(reduced: xr.Dataset, axis: str, spread: float) -> tuple[float, flo
     tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * most)
     half, far = tails - 3.0, most - tails
     share = (half + np.sqrt(half**2 + far * half)) / far
-    raised = np.maximum(reduced["variance"].sel(axis=axis).values[good] / spread**2 - 1.0, 0.0) + _USUAL
-    share = np.where(many > 1.0, np.fmin(share, raised), share)
+    variance = reduced["variance"].sel(axis=axis).values
+    calm = (count == 0.0) & (variance > 0.0)  # most blocks may have spikes: the median of all would not be the noise
+    usual = float(np.median(variance[calm] if calm.sum() >= _CALM else variance[good] / (1.0 + share)))
+    share = np.where(many > 1.0, np.fmin(share, np.maximum(variance[good] / usual - 1.0, 0.0) + _USUAL), share)
     square = float((share * samples[good]).sum() / many.sum())
     limit = _DEPARTURE * outlier_limit(float(samples.sum()))
     ends = np.geomspace(1.0, 1e-4, 400)  # the least size that is seen, over the rms size
     seen_squares = (limit / ends) ** 2 * (1.0 + ends * norm.pdf(ends) / norm.sf(ends))
     size = limit / float(np.interp(square, seen_squares, ends))
-    return float(2.0 * norm.sf(limit / size)), size * spread, float(many.sum())
+    return float(2.0 * norm.sf(limit / size)), size * math.sqrt(usual), float(many.sum())
 
 
 def _spread(reduced: xr.Dataset, axis: str) -> float:
