@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import warnings
 
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 import xarray as xr
 
 import gyrostab
+from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.calibration.known import known_motion, without_known_motion
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
 from tests.named import nulls, record
 
@@ -51,6 +55,28 @@ def test_what_is_loud_in_other_blocks_is_not_the_jump(jumped):
     start = np.datetime64(found.content["recording"]["start"].removesuffix("Z"))
     spans = [[(np.datetime64(box[end].removesuffix("Z")) - start) / np.timedelta64(1, "s") for end in ("start", "end")] for box in left]
     assert any(begin < 1300 and end > 1200 for begin, end in spans)
+
+
+def test_hops_between_two_levels_leave_no_line_against_their_own_model():
+    hops = {"name": "telegraph", "step": [1.0], "low": 200.0, "high": 200.0}
+    found = _diagnosed(_log([hops], 7), [hops])
+    assert (found.verdict, found.content["mismatches"]) == ("no mismatch", [])
+    assert {one["name"] for one in found.content["baseline"]["expected"]} == {"telegraph"}
+
+
+def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
+    """The core reads the log again for its lines; what is loud in blocks that are left out does not matter then."""
+    core = importlib.import_module("gyrostab.diagnose.core")
+    reduced = reduce_log(jumped)
+    baseline = calibrate(reduced)
+    course = np.zeros((1, reduced.sizes["block"]))
+    course[:, :12:2] = 5.0  # the first part has the blocks 0 to 11
+    known = baseline.assign(known_mean=(("axis", "block"), course))
+    found = core._still_lines(jumped, reduced, known, 5.0, no_stage)
+    assert found["line_weight"].values[0, 0] == 0.0
+    np.testing.assert_allclose(found["line_power"][:, 2:], reduced["line_power"][:, 2:])
+    xr.testing.assert_identical(found.drop_vars(["line_power", "line_weight"]), reduced.drop_vars(["line_power", "line_weight"]))
+    assert core._still_lines(jumped, reduced, baseline, 5.0, no_stage) is reduced
 
 
 def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_else():
