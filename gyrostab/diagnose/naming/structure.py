@@ -15,6 +15,7 @@ from gyrostab.diagnose.gains.levels import level_gains
 from gyrostab.diagnose.naming.claims import Claim, Unknown
 from gyrostab.diagnose.naming.filters import on_all_axes
 from gyrostab.diagnose.naming.jumps import sudden
+from gyrostab.diagnose.naming.steady import always_there
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.registry import effects
 
@@ -97,6 +98,8 @@ def _possible(part: Part, state: State) -> bool:
     if view == "mean" and not _in_range(part, state):
         return False
     if view == "levels" and _more_levels(part, state):
+        return False
+    if not always_there(part, state):
         return False
     return not (part.variant.squared and view == "power" and part_size(part, state)[0] <= 0.0)
 

@@ -1,0 +1,48 @@
+"""What nothing drives is there all the time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from gyrostab.diagnose.calibration.baseline import from_model
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import State, begin_state
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.search import gains
+from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.naming.parts import by_key
+from gyrostab.diagnose.naming.steady import always_there
+from gyrostab.diagnose.naming.structure import possible
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.log import make_log
+
+MODEL = {"noise": {"N": 0.003}, "log": {"axes": ["x"]}}
+SECOND = np.arange(24_000) / 10.0
+
+
+def _wandering(size: float, share: float, seed: int) -> tuple[list[Part], State]:
+    """Parts of a Gauss-Markov bias of 0.5 s that is there in every such share of 600 s."""
+    rng = np.random.default_rng(seed)
+    white = 0.003 * 60.0 * np.sqrt(10.0) * rng.standard_normal(SECOND.size)
+    keep = np.exp(-0.2)
+    bias = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(SECOND.size))
+    reduced = reduce_log(make_log(white + size * bias * (share * 600.0 > SECOND % 600.0), rate=10.0, unit="deg/h"))
+    baseline = from_model(reduced, MODEL)
+    biases = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.key == "gauss_markov" and one.view == "power"]
+    state = begin_state(reduced, baseline)
+    return by_key(gains(biases, reduced, state, fold_blocks(reduced)))["gauss_markov"], state
+
+
+@pytest.mark.parametrize("size", [0.12, 0.18])
+@pytest.mark.parametrize(("share", "steady"), [(1.0, True), (0.5, False)])
+def test_what_comes_and_goes_is_no_steady_wander(size: float, share: float, steady: bool) -> None:
+    parts, state = _wandering(size / np.sqrt(share), share, seed=3)
+    assert parts[0].gain > 10.0
+    assert always_there(parts[0], state) == steady
+    assert bool(possible(parts, state)) == steady
+
+
+def test_chance_takes_no_steady_wander_away() -> None:
+    assert all(always_there(parts[0], state) for parts, state in (_wandering(0.2, 1.0, seed) for seed in range(8)))
