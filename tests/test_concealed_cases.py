@@ -13,7 +13,7 @@ import xarray as xr
 import gyrostab
 from gyrostab.concealed import channel_detector, make_case, open_truth, plan_case, plan_cases, salt, seal
 from gyrostab.concealed.catalogue import CATALOGUE, STRANGE
-from gyrostab.concealed.limits import NATS, amplitude_for, mean_size, shared_size, variance_gain, variance_size
+from gyrostab.concealed.limits import NATS, amplitude_for, learned_gain, mean_size, shared_size, variance_gain, variance_size
 from gyrostab.concealed.naive import allan_detector
 from gyrostab.concealed.plan import SEVERINGS
 from gyrostab.concealed.record import signal
@@ -48,6 +48,17 @@ def test_limit_of_a_mean_is_the_closed_form():
     effective = 300 * (1 - 300 / 2000)
     smallest = 60 * 0.004 * math.sqrt(2 * NATS / effective)
     assert mean_size(world, mean * smallest) == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(("frequency", "least", "most"), [(0.5, 0.8, 1.0), (1 / 4000, 0.0, 0.2)], ids=["fast", "slow"])
+def test_noise_that_is_learned_takes_in_a_slow_mean_and_no_fast_one(frequency, least, most):
+    world = white_world()
+    mean = np.zeros((3, world.size))
+    mean[1] = np.cos(2 * math.pi * frequency * np.arange(world.size) / world.rate)
+    mean *= 8.0 / mean_size(world, mean)
+    share = learned_gain(world, mean) / (NATS * 64.0)
+    assert least <= share <= most
+    assert learned_gain(world, np.zeros_like(mean)) == 0.0
 
 
 def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():

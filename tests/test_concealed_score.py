@@ -57,6 +57,7 @@ def truth(*names: str, kind: str = "single", strength: float = 2.0, index: int =
             "strength": strength,
             "size": strength,
             "expected_nats": 10.0,
+            "learned_nats": 4.5,
             "tau_min_s": 1.0,
             "tau_max_s": 10.0,
             "localised": localised,
@@ -88,7 +89,8 @@ def test_a_right_claim_earns_every_mark():
     assert row["iou"] == pytest.approx(0.5)
     assert row["tau_hit"] is True
     assert row["numbers"] == [{"parameter": "sensitivity", "held": True, "pull": pytest.approx(-0.4)}]
-    assert (row["gain"], row["oracle"]) == (9.0, 10.0)
+    assert (row["gain"], row["oracle"], row["learned"]) == (9.0, 10.0, 4.5)
+    assert row["learned_strength"] == pytest.approx(math.sqrt(4.5 / 5.7))
     missing = parameters | {"sensitivity": parameters["sensitivity"] | {"low": 0.55}}
     (number,) = one(diagnosis(claim("vibration_rectification", parameters=missing)), truth("vibration_rectification"))["numbers"]
     assert number["held"] is False
@@ -208,6 +210,15 @@ def test_a_table_of_known_marks():
     assert table.loc["channel withheld or replaced: wrong name", "value"] == 1.0
     assert table.loc["overlap in time (IoU), median", "value"] == 1.0
     assert table.loc["gain over the oracle's, median", "value"] == pytest.approx(0.95)
+    learned = table.loc["gain over that of the truth where noise is learned from the record, median", "value"]
+    assert learned == pytest.approx(0.95 * 10.0 / 4.5)
+    strong = table.loc["detected, of those that were alone and are as strong in noise learned from the record", ["value", "n"]]
+    assert strong["n"] == 0
+    louder = score_table([row | {"learned_strength": 2.0} for row in rows]).set_index("quantity")
+    alone = table.loc["named rightly, of those that were alone", "n"] + sum(
+        row["kind"] in ("single", "buried") and row["strength"] >= 1.5 and not row["detected"] for row in rows
+    )
+    assert louder.loc["detected, of those that were alone and are as strong in noise learned from the record", "n"] == alone > 0
     assert table.loc["effects at 1.5 times the limit and more seen by the plain Allan plot", "value"] == 0.25
     said = missed(score_table(rows))
     assert any(line.startswith("detected at 1.5") for line in said)

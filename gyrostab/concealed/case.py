@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.concealed import environment, telemetry
 from gyrostab.concealed.catalogue import CATALOGUE, STRANGE, Entry
+from gyrostab.concealed.limits import learned_gain
 from gyrostab.concealed.plan import STRENGTHS
 from gyrostab.concealed.record import channels_of, lost, make_log, signal
 from gyrostab.concealed.sever import sever
@@ -171,6 +172,7 @@ def _told(world: World, effect: Effect, strength: float) -> dict[str, Any]:
         "strength": float(strength),
         "size": float(effect.size),
         "expected_nats": float(effect.nats),
+        "learned_nats": float(effect.nats if effect.mean is None else min(effect.nats, learned_gain(world, effect.mean))),
         "tau_min_s": float(effect.tau[0]),
         "tau_max_s": float(effect.tau[1]),
         "localised": effect.active is not None,

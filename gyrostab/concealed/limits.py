@@ -8,21 +8,23 @@ log variance by v in n samples is worth ``n v^2 / 4``, which gives ``2 sqrt(c / 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.optimize import minimize
 
 from gyrostab.concealed.floor import floor_psd
 from gyrostab.concealed.world import World, per_second
 
-__all__ = ["NATS", "amplitude_for", "mean_size", "shared_size", "variance_gain", "variance_size"]
+__all__ = ["NATS", "amplitude_for", "learned_gain", "mean_size", "shared_size", "variance_gain", "variance_size"]
 
 Array = NDArray[np.float64]
 
 #: Log-likelihood at the limit.
 NATS = 5.7
+_STRETCHES = 400  # of the spectrum
 
 
 def mean_size(world: World, mean: Array, *, white: bool = False) -> float:
@@ -40,19 +42,59 @@ def mean_size(world: World, mean: Array, *, white: bool = False) -> float:
     float
         The square root of the expected log-likelihood over `NATS`.
     """
-    there = ~world.missing
     nats = 0.0
+    for f, power, noise in _mean_lines(world, mean):
+        density = floor_psd(f, noise={"N": noise["N"]} if white else noise, rate=world.rate)
+        nats += 0.5 * float((power / density).sum())
+    return math.sqrt(nats / NATS)
+
+
+def _mean_lines(world: World, mean: Array) -> Iterator[tuple[Array, Array, dict[str, float]]]:
+    """Of every axis that a mean is on: frequencies [Hz], its power there as far as it is recorded [(deg/h)2/Hz], the noise."""
+    there = ~world.missing
     for values, noise in zip(mean, world.noise, strict=True):
-        centred = values - values[there].mean()
         whole = float(((values - values.mean()) ** 2).sum())
         if whole == 0:
             continue
         lines = fft.dct(values - values.mean(), norm="ortho")[1:]
         f = np.arange(1, world.size) * world.rate / (2 * world.size)
-        density = floor_psd(f, noise={"N": noise["N"]} if white else noise, rate=world.rate)
-        seen = float((centred[there] ** 2).sum()) / whole
-        nats += 0.5 * seen * float((lines**2 / density).sum()) / world.rate
-    return math.sqrt(nats / NATS)
+        seen = float(((values[there] - values[there].mean()) ** 2).sum()) / whole
+        yield f, seen * lines**2 / world.rate, noise
+
+
+def learned_gain(world: World, mean: Array) -> float:
+    """Expected log-likelihood [nats] of a known mean (axis, time) over noise that is fitted to the same record without it.
+
+    Angle random walk, bias instability and rate random walk of each axis are what suits best where the mean is taken for noise: a slow
+    mean is worth a part only of what it is where the noise is known beforehand.
+
+    Parameters
+    ----------
+    world : World
+    mean : ndarray, shape (axis, time)
+    """
+    return sum(_learned(f, power, noise, world.rate) for f, power, noise in _mean_lines(world, mean))
+
+
+def _learned(f: Array, power: Array, noise: dict[str, float], rate: float) -> float:
+    """Of one axis: the divergence of noise and mean from the nearest noise, over stretches of the spectrum in which noise is one level."""
+    first = np.unique(np.geomspace(1, f.size, _STRETCHES).astype(np.int64)) - 1
+    count = np.diff(np.append(first, f.size))
+    f, power = (np.add.reduceat(values, first) / count for values in (f, power))
+    known = floor_psd(f, noise=noise, rate=rate)
+    alone = np.stack(
+        [floor_psd(f, noise={"Q": noise.get("Q", 0.0)}, rate=rate), *(floor_psd(f, noise={one: 1.0}, rate=rate) for one in "NBK")]
+    )
+
+    def apart(logarithms: Array) -> float:
+        ratio = known / (alone[0] + np.exp(logarithms) @ alone[1:])
+        return 0.5 * float((count * (ratio * (1 + power / known) - 1 - np.log(ratio))).sum())
+
+    white = known[-1] / alone[1, -1]
+    meets = [known[place] / alone[2:, place] for place in range(0, f.size, max(1, f.size // 4))]  # either is as loud as all that is known
+    starts = [np.log([white, *np.where(chosen, level, level * 1e-3)]) for level in meets for chosen in ([True, False], [False, True])]
+    found = [minimize(apart, start, method="Nelder-Mead", options={"maxiter": 400}).fun for start in starts]
+    return float(max(0.0, min(found)))
 
 
 def _weights(world: World, ratio: Array) -> Array:

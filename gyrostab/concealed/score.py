@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from gyrostab.concealed.catalogue import merged
+from gyrostab.concealed.limits import NATS
 from gyrostab.errors import SchemaError
 
 __all__ = ["intersection_over_union", "score_case"]
@@ -133,8 +135,8 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
     list of dict
         A row for every true effect, or one row where there is none: ``kind``, ``effect``, ``strength``, ``detected``, ``named`` (classes
         merged by the ambiguity sets), ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (names that stand for nothing true),
-        ``unknown``, ``iou``, ``tau_hit``, ``numbers``, ``gain``, ``oracle``, ``seconds``, ``claims`` and more. A name is counted once,
-        on however many axes it is claimed.
+        ``unknown``, ``iou``, ``tau_hit``, ``numbers``, ``gain``, ``oracle``, ``learned`` (the oracle's, where noise is learned from the
+        record), ``seconds``, ``claims`` and more. A name is counted once, on however many axes it is claimed.
 
     Raises
     ------
@@ -166,12 +168,13 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
         "claims": [(claim["name"], bool(_names(claim) & standing)) for claim in claims],
         "gain": float((diagnosis["held_out"] or {}).get("log_likelihood_gain") or 0.0),
         "oracle": float(sum(effect["expected_nats"] for effect in truth["effects"])),
+        "learned": float(sum(effect.get("learned_nats", np.nan) for effect in truth["effects"])),
         "coverage_after": (diagnosis["held_out"] or {}).get("coverage95_after"),
         "seconds": float(diagnosis.get("seconds") or 0.0),
         "naive": dict(naive or {}),
     }
     if not true:
-        return [case | {"effect": None, "strength": 0.0, "size": 0.0, "form_differs": None}]
+        return [case | {"effect": None, "strength": 0.0, "learned_strength": None, "size": 0.0, "form_differs": None}]
     return [case | _row(diagnosis, claims, effect, accepted, true) for effect in truth["effects"]]
 
 
@@ -186,6 +189,7 @@ def _row(
     row: dict[str, Any] = {
         "effect": name,
         "strength": effect["strength"],
+        "learned_strength": math.sqrt(effect["learned_nats"] / NATS) if "learned_nats" in effect else None,
         "size": effect["size"],
         "form_differs": effect["form_differs"],
         "named": bool(top and top["name"] in merged(name)),

@@ -65,12 +65,14 @@ def _naming(rows: Sequence[Row]) -> list[Line]:
     clear = _here(rows, least=CLEAR)
     seen = [row for row in clear if row["detected"]]
     alone = [row for row in clear if row["kind"] in ("single", "buried")]
+    shown = [row for row in alone if (row.get("learned_strength") or 0.0) >= CLEAR]
     claimed = [row for row in clear if row["set_size"]]
     percent = Target(">= 95 %", least=0.95)
     return [
         share("effects whose form the fitter does not have", (row["form_differs"] for row in _here(rows)), Target(">= 33 %", least=0.33)),
         share("detected at 1.5 times the limit and more", (row["detected"] for row in clear), percent),
         share("detected, of those that were alone", (row["detected"] for row in alone)),
+        share("detected, of those that were alone and are as strong in noise learned from the record", (row["detected"] for row in shown)),
         share("named rightly, of those (sets merged)", (row["named"] for row in seen), percent),
         share("named rightly, of those that were alone", (row["named"] for row in alone if row["detected"])),
         share("named rightly, of those in pairs and triples", (row["named"] for row in seen if row["kind"] in ("pair", "triple"))),
@@ -114,6 +116,7 @@ def _numbers(rows: Sequence[Row]) -> list[Line]:
     found = [(row, number) for row in clear for number in row["numbers"]]
     coverage = Target("90-98 %", least=0.90, most=0.98)
     gains = [(row["gain"] / row["oracle"], _all_named(row, rows)) for row in cases(clear) if row["named"] and _known_gain(row)]
+    learned = [row["gain"] / row["learned"] for row in cases(clear) if row["named"] and _known_gain(row) and row.get("learned", 0.0) > 0]
     others = [number["held"] for row, number in found if row["effect"] != "shared_source"]
     return [
         median("overlap in time (IoU), median", (row["iou"] for row in clear), Target(">= 0.7", least=0.7)),
@@ -126,6 +129,7 @@ def _numbers(rows: Sequence[Row]) -> list[Line]:
         ),
         median("gain over the oracle's, median", (gain for gain, _ in gains), Target("0.9-1.2", least=0.9, most=1.2)),
         median("gain over the oracle's where all was named rightly, median", (gain for gain, whole in gains if whole)),
+        median("gain over that of the truth where noise is learned from the record, median", learned),
         share("gain of 0.7 of the oracle's or more", (gain >= 0.7 for gain, _ in gains)),
         median(
             "share of predicted cells inside the 95 % band, median",
