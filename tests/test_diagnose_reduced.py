@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.reduction.outliers import lattice_step
 from gyrostab.diagnose.reduction.reduced import block_samples, reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.periodogram import band_edges, ordinates, taper
@@ -214,87 +213,6 @@ def test_a_profile_shows_the_error_by_phase_of_the_ramp():
     assert profile == pytest.approx(np.where(reduced.phase.values > 0.75, 3.0, -1.0), abs=0.15)
 
 
-def test_marks_are_counted_where_they_are():
-    rng = np.random.default_rng(9)
-    x = rng.standard_normal(60 * 1000)
-    clean = reduce_log(log_of(x), block="10s")
-    assert int(clean.outliers.sum()) == 0
-    assert int(clean.repeats.sum() + clean.zeros.sum()) == 0
-    assert int(clean.extremes.sum()) == 2
-    assert clean.lattice.values == 0.0
-    assert np.abs(clean.kurtosis.values).max() < 0.6
-    y = x.copy()
-    y[5_500] += 40.0
-    y[10_200:10_220] = y[10_199]
-    y[20_100:20_105] = 0.0
-    y[30_000:31_000] = np.clip(y[30_000:31_000], -1.0, 50.0)
-    y[40_000:50_000] *= 30.0  # louder, and yet without outliers
-    marked = reduce_log(log_of(y), block="10s")
-    assert marked.outliers.values[0, 5] == 3
-    assert int(marked.outliers.sum()) - 3 <= 3  # the edges of the loud stretch at most
-    assert marked.repeats.values[0, 10] == 20
-    assert marked.repeats.values[0, 20] == 0  # of zeros something else is told
-    assert marked.zeros.values[0, 20] == marked.filled.values[0, 20] == 5
-    assert marked.kurtosis.values[0, 5] > 10.0
-    assert marked.kurtosis.values[0, 30] < -0.3
-    clipped = reduce_log(log_of(np.clip(x, -2.0, 2.0)), block="10s")
-    assert int(clipped.extremes.sum()) == int((np.abs(x) >= 2.0).sum())
-    assert int(clipped.repeats.sum()) == 0  # at the ends
-
-
-def test_zeros_of_one_axis_are_stuck_and_those_of_all_are_filled():
-    rng = np.random.default_rng(10)
-    x = rng.standard_normal((3, 60 * 1000))
-    x[1, np.abs(x[1]) < 0.02] = 0.0
-    lost = np.zeros(x.shape[1], bool)
-    for first in rng.integers(0, 60 * 998, 12):
-        lost[first : first + 30] = True
-    at = (x[1] == 0.0).sum(), lost.sum(), (lost & (x[1] == 0.0)).sum()
-    x[:, lost] = 0.0
-    reduced = reduce_log(log_of(x), block="10s")
-    np.testing.assert_array_equal(reduced.filled.sum("block"), [at[1]] * 3)
-    np.testing.assert_array_equal(reduced.stuck.sum("block"), [0, at[0] - at[2], 0])
-    np.testing.assert_array_equal(reduced.zeros.sum("block"), (x == 0.0).sum(axis=1))
-    assert int(reduced.repeats.sum()) == 0
-
-
-@pytest.mark.parametrize("axes", [1, 3])
-def test_wide_dead_zones_are_stuck_and_not_filled(axes: int):
-    """A third of the samples stick: by chance two in a row, or two axes at once."""
-    x = np.random.default_rng(11).standard_normal((axes, 60 * 1000)) + 0.1
-    x[np.abs(x) < 0.43] = 0.0
-    reduced = reduce_log(log_of(x), block="10s")
-    zeros = (x == 0.0).sum()
-    assert 0.3 < zeros / x.size < 0.36
-    assert reduced.stuck.sum() > 0.96 * zeros
-
-
-def test_zeros_at_the_end_of_a_range_are_not_stuck():
-    x = np.maximum(np.random.default_rng(12).standard_normal((2, 60 * 1000)), 0.0)
-    reduced = reduce_log(log_of(x), block="10s")
-    assert int(reduced.stuck.sum()) == 0
-    np.testing.assert_array_equal(reduced.extremes.sum("block"), (x == 0.0).sum(axis=1) + 1)
-
-
-def test_held_samples_do_not_make_outliers_of_the_others():
-    rng = np.random.default_rng(9)
-    x = rng.standard_normal(60 * 1000)
-    x[20_000:24_500] = x[20_000]
-    assert int(reduce_log(log_of(x), block="10s").outliers.sum()) == 0
-
-
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**31), step=st.floats(0.01, 3.0), offset=st.floats(-5e4, 5e4), single=st.booleans())
-def test_the_lattice_is_found_whatever_its_offset(seed: int, step: float, offset: float, single: bool):
-    noise = np.random.default_rng(seed).standard_normal(8000)
-    values = np.round(noise / step) * step + offset
-    values = values.astype(np.float32).astype(np.float64) if single else values
-    if not single or step > 1.01 * 64 * 8 * 2.0**-23 * np.abs(values).max():
-        assert lattice_step(values) == pytest.approx(step, rel=1e-3)
-    smooth = noise * step + offset
-    assert lattice_step(smooth) == 0.0
-
-
 # -------------------------------------------------------------------------------------------------------- channels and spans
 
 
@@ -441,12 +359,3 @@ def test_progress_reaches_its_end():
     told = []
     reduce_log(log_of(np.random.default_rng(0).standard_normal((3, 50_000))), progress=lambda *given: told.append(given))
     assert told[-1][2] == told[-1][1] > 0.98 * 3 * 50_000
-
-
-def test_the_lattice_shows_where_spikes_off_it_are_as_common_as_its_rare_levels():
-    rng = np.random.default_rng(9)
-    values = np.round(rng.standard_normal(4000) / 0.1) * 0.1
-    off = np.concatenate([values[:12] + 7.03, np.full(8, 6.777)])
-    assert lattice_step(np.concatenate([values, off])) == pytest.approx(0.1, rel=1e-9)
-    half = np.where(np.arange(4000) < 2000, values, rng.standard_normal(4000))  # half of the values have none
-    assert lattice_step(half) == 0.0
