@@ -97,3 +97,11 @@ def test_what_a_model_lacks_is_named_and_in_the_powers_thereafter():
         assert found.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(sign * 0.0015, rel=0.15)
     held = found.content["held_out"]
     assert abs(held["misfit_after"] - 1.0) < 0.5 * abs(held["misfit_before"] - 1.0)
+
+
+def test_a_low_pass_of_what_two_axes_share_leaves_no_filter_and_nothing_unknown():
+    slow = {"name": "shared_source", "N": [0.0, 0.004, 0.004], "bandwidth": 0.8}
+    model = {"noise": NOISE, "effect": [slow], "log": {"axes": ["x", "y", "z"]}}
+    found = gyrostab.diagnose(simulate(model, duration="30min", rate=10.0, seed=5).compute(), nulls=100)
+    assert [effect["name"] for effect in found.effects] == ["shared_source"]
+    assert found.verdict == "explained", found.content["mismatches"]

@@ -320,7 +320,7 @@ class SharedSource(Effect):
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """No low-pass; or one within the band."""
-        return {"bandwidth": np.array([windows.rate / 20.0, windows.rate / 4.0, math.inf])}
+        return {"bandwidth": np.append(windows.rate / np.array([40.0, 20.0, 10.0, 5.0]), math.inf)}
 
     def explain(self, windows: Windows) -> Prediction:
         """A spectrum, the same process on all axes."""

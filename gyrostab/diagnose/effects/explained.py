@@ -37,6 +37,7 @@ FLOOR = 0.2
 _LINE_REACH = 3  # lines on each side of one that belong to it
 _FEW = 0.5  # of the blocks at most may be masked
 _ODD = 0.75  # of them may be left out for odd samples
+_FLAT = 0.04  # of a density, by which its bands may differ where it is white
 _TURN = 0.2  # change of the logarithm of the noise power from block to block
 
 
@@ -137,13 +138,21 @@ def _cross(state: State, part: Part) -> State:
         chosen = cross_column(one, row, state.reduced)
         columns.append(np.concatenate([chosen.real, chosen.imag], axis=-1))
     state = state.with_columns("cross", ",".join(part.row), columns)
-    if state.baseline.attrs.get("source", "calibrated") == "calibrated" or not part.variant.squared:
-        return state  # what was calibrated on the recording has the power of all that its axes share
-    for axis in part.row:
-        powers = [power_column(one.real, state.axes.index(axis), state) for one in part.variant.design]
+    if not part.variant.squared:
+        return state
+    calibrated = state.baseline.attrs.get("source", "calibrated") == "calibrated"
+    added = [one.real for one in part.variant.design if not (calibrated and _white(one))]  # white noise was calibrated with it
+    for axis in part.row if added else ():
+        powers = [power_column(one, state.axes.index(axis), state) for one in added]
         known = state.given.get(("power", axis), [])
         state = state.with_columns("power", axis, [one for one in powers if not any(np.array_equal(one, other) for other in known)])
     return state
+
+
+def _white(density: NDArray[np.complex128]) -> bool:
+    """Whether a density is the same in all bands, to the error of a form."""
+    size = np.abs(density)
+    return bool(np.ptp(size, axis=-1).max() <= _FLAT * size.max(initial=0.0))
 
 
 def _coherent(state: State, axes: tuple[str, ...], density: Array) -> State:
