@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from gyrostab import diagnose
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.conclusion.content import motion_tables
 from gyrostab.diagnose.effects.candidates import windows_of
 from gyrostab.diagnose.naming.moving import moving_blocks, unexplained_motion, without_motion
 from gyrostab.diagnose.reduction.reduced import measured, reduce_log
+from gyrostab.errors import SchemaError
 from gyrostab.simulate import simulate
 
 N = 0.01
@@ -138,3 +140,16 @@ def test_one_mismatch_says_where_it_moves_and_who_sees_it(seen):
     (witnessed,) = motion_tables([claim("misalignment", "mean", "x")], rest, [])
     assert "axis x sees a share" in witnessed["statement"]
     assert "real rotation" in witnessed["statement"]
+
+
+def test_what_moves_stays_in_where_the_rest_is_too_little_to_calibrate_on(turning):
+    sparse = np.random.default_rng(3).random(turning.sizes["time"]) < 0.85  # too few samples for spectra
+    sparse[BEGIN:END] = False
+    gone = xr.DataArray(sparse, dims="time") & (turning["axis"] == "z")
+    log = turning.assign(rate=turning["rate"].where(~gone).transpose("axis", "time").assign_attrs(turning["rate"].attrs))
+    whole = reduce_log(log)
+    with pytest.raises(SchemaError, match="axis z"):
+        calibrate(without_motion(log, whole, moving_blocks(whole)))
+    with pytest.warns(UserWarning, match="compared with its motion in it.*axis z"):
+        found = diagnose(log, nulls=100)
+    assert found.verdict != "no mismatch"

@@ -174,8 +174,11 @@ def _diagnose(
     reduced, baseline, found, naming, null = compared(reduced)
     moving = unexplained_motion(reduced, naming.claims) if given is None else np.zeros(1, np.bool_)
     if moving.any():
-        reduced = without_motion(log.sel(axis=alive), reduced, moving, restart_gap=restart_gap, progress=progress)
-        reduced, baseline, found, naming, null = compared(reduced)
+        at_rest = without_motion(log.sel(axis=alive), reduced, moving, restart_gap=restart_gap, progress=progress)
+        try:
+            reduced, baseline, found, naming, null = compared(at_rest)
+        except SchemaError as error:
+            warnings.warn(f"compared with its motion in it, for what is at rest does not do: {error}", stacklevel=3)
     progress("fitting", 0)
     own = given if isinstance(given, Model) else None
     return _concluded(reduced, baseline, found, naming, null, still, level=level, given=own, begun=begun)
