@@ -17,6 +17,7 @@ from gyrostab.concealed.limits import NATS, amplitude_for, learned_gain, mean_si
 from gyrostab.concealed.naive import allan_detector
 from gyrostab.concealed.plan import SEVERINGS
 from gyrostab.concealed.record import signal
+from gyrostab.concealed.salt import counts_of
 from gyrostab.concealed.seal import truth_text
 from gyrostab.concealed.sever import sever
 from gyrostab.concealed.visible import FAINT
@@ -336,6 +337,22 @@ def test_salt_on_a_log_adds_the_effect_and_leaves_the_controls_alone():
         assert told["plan"]["kind"] == ("salted" if told["effects"] else "control")
     with pytest.raises(OptionError, match="follows restarts"):
         salt(log, "warm_up", 2.0, np.random.default_rng(0))
+
+
+def test_salt_on_a_log_of_counts_is_counted_and_keeps_its_mean():
+    log, _ = make_case(small(None, rate=10.0, seconds=1200))
+    counted = np.rint(log.rate.values / 0.5) * 0.5
+    copies = salt(log.assign(rate=(log.rate.dims, counted, log.rate.attrs)), "vibration_rectification", 8.0, np.random.default_rng(2))
+    salted, truth = copies["salted"]
+    seen = np.isfinite(counted)
+    assert counts_of(counted[0]) == pytest.approx(0.5)
+    np.testing.assert_allclose(np.remainder(salted.rate.values[seen] / 0.5 + 0.25, 1.0), 0.25, atol=1e-6)
+    sent = {axis: np.array(values) for axis, values in truth["effects"][0]["waveform_10s"].items()}
+    axis, expected = max(sent.items(), key=lambda one: np.ptp(one[1]))
+    row = list(salted.axis.values).index(axis)
+    added = np.nanmean((salted.rate.values - counted)[row].reshape(-1, 100), axis=1)
+    scatter = 0.5 / math.sqrt(12 * 100)
+    assert np.nanmax(np.abs(added - expected)) < 8 * scatter
 
 
 def test_salt_on_a_real_gyro(recordings):

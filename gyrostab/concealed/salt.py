@@ -19,11 +19,13 @@ from gyrostab.errors import OptionError
 from gyrostab.schema import check_log, signal_name
 from gyrostab.timegrid import first_stamp
 
-__all__ = ["rough_noise", "salt"]
+__all__ = ["counts_of", "rough_noise", "salt"]
 
 Array = NDArray[np.float64]
 
 _TRIES = 60
+_SAME, _WHOLE = 1e-9, 1e-3  # of the range, by which equal values may differ; of a step
+_FEW = 0.2  # levels for each sample, beyond which there is no lattice
 
 
 def rough_noise(record: Array, *, rate: float) -> dict[str, float]:
@@ -76,6 +78,34 @@ def _added(world: World, effect: Effect, rng: np.random.Generator) -> Array:
     return total
 
 
+def counts_of(values: Array) -> float:
+    """Step of the lattice that values (time,) stand on, as a converter counts them; 0 where there is none.
+
+    Examples
+    --------
+    >>> counts_of(np.random.default_rng(0).integers(-9, 9, 1000) * 0.25), counts_of(np.random.default_rng(0).normal(0, 1, 1000))
+    (0.25, 0.0)
+    """
+    levels = np.unique(values[np.isfinite(values)])
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > _SAME * max(float(np.ptp(levels)) if levels.size else 0.0, 1e-300)]
+    if gaps.size == 0 or gaps.size > _FEW * values.size:
+        return 0.0
+    step = float(gaps.min())
+    return step if np.abs(gaps / step - np.rint(gaps / step)).max() < _WHOLE else 0.0
+
+
+def _as_counted(record: Array, added: Array, rng: np.random.Generator) -> Array:
+    """Record and effect together (axis, time); counted as the record is, up or down by chance, so that the mean is that of the effect."""
+    total = record + added
+    for row, values in enumerate(record):
+        step = counts_of(values)
+        if step > 0.0:
+            level = float(values[np.isfinite(values)][0])
+            total[row] = level + step * np.floor((total[row] - level) / step + rng.random(values.size))
+    return total
+
+
 def salt(log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator) -> dict[str, tuple[xr.Dataset, dict[str, Any]]]:
     """Put an effect into a real log, and make the controls.
 
@@ -116,7 +146,7 @@ def salt(log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator
     record = np.asarray(log["rate"].values[:3], dtype=float)
     axes = [str(name) for name in log["axis"].values[:3]]
     world, made = _drawn(log, record, effect, strength, rng)
-    salted = record + _added(world, made, rng)[: len(axes)]
+    salted = _as_counted(record, _added(world, made, rng)[: len(axes)], rng)
     if made.after is not None:
         padded = np.concatenate([salted, np.zeros((3 - len(axes), world.size))])
         salted = made.after(padded)[: len(axes)]
