@@ -192,6 +192,15 @@ def test_gain_of_other_views_is_added():
     assert (result["log_likelihood_gain"], result["stderr"]) == (3.5, pytest.approx(np.sqrt(7.0)))
 
 
+def test_the_allan_variance_is_compared_with_the_model_that_is_shown():
+    base, found = _record()
+    _add_effects(found, epsilon=0.5)
+    whole = _with_effects(base, epsilon=0.5)
+    seen, blind = held_out(found, base, base, more_gain=3.5, shown=whole), held_out(found, base, base, more_gain=3.5)
+    assert seen["log_likelihood_gain"] == blind["log_likelihood_gain"] == pytest.approx(3.5)
+    assert abs(seen["misfit_after"] - 1.0) < 0.3 * abs(blind["misfit_after"] - 1.0)
+
+
 def test_stretches_cover_the_record_once_and_short_records_are_refused():
     _, found = _record()
     cut = stretches(found)

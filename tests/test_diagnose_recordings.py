@@ -50,6 +50,10 @@ def test_resets_of_the_ramp_come_before_their_lines(log_of: Callable[..., Any]) 
     assert lines
     assert all("feedback_reset" in box["explained_by"] for box in lines)
     assert "spectral_line" not in lines[0]["explained_by"]
+    held = found.content["held_out"]
+    assert held["coverage95_before"] < 0.6
+    assert held["coverage95_after"] > 0.85  # with the resets in the powers
+    assert held["misfit_after"] < 0.2 * held["misfit_before"]
 
 
 def test_the_turns_of_the_ramp_are_counted(log_of: Callable[..., Any]) -> None:

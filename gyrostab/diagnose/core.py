@@ -291,17 +291,18 @@ def _concluded(
     after = predicted(naming, noise) if naming.claims else before
 
     told, hopping = without_levels(raw)
-    told, waving = without_waves(told)
+    judged, waving = without_waves(told)
 
-    def trained(known: NDArray[np.bool_]) -> xr.Dataset:
-        own = recalibrate(told, baseline, first, known)
-        return predicted(with_noise(told, own), own, known)
+    def trained(chosen: Naming, known: NDArray[np.bool_]) -> xr.Dataset:
+        own = recalibrate(chosen, baseline, first, known)
+        return predicted(with_noise(chosen, own), own, known)
 
     parts = [part for claim in told.claims for part in claim.parts]
     odd = sum(part.gain for part in parts if part.candidate.view == "marks")  # no other number has them
     clean = without_odd(reduced, [*parts, *(part for claim in told.expected for part in claim.parts)])
     start = partial(expected_baseline, told, baseline) if told.expected else baseline
-    held = held_out(clean, start, trained if told.claims else start, more_gain=odd + hopping + waving)
+    whole, rest = (partial(trained, one) if one.claims else start for one in (told, judged))
+    held = held_out(clean, start, rest, more_gain=odd + hopping + waving, shown=whole if waving else None)
 
     def without(left_out: Sequence[Claim]) -> xr.Dataset:
         return predicted(naming, noise, left_out=left_out)

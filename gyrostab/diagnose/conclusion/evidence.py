@@ -28,7 +28,9 @@ _SHORT = 5  # blocks
 _INSIDE = 1.959964  # standard deviations that hold 95 %
 
 
-def held_out(reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain: float = 0.0) -> dict[str, float]:
+def held_out(
+    reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain: float = 0.0, shown: Trained | None = None
+) -> dict[str, float]:
     """Compare two models of a recording on time that they have not seen.
 
     The record is cut into stretches; every fourth is held out in turn, and the models are fitted to the rest. Where the models differ in
@@ -46,6 +48,8 @@ def held_out(reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain:
     more_gain : float
         Held-out gain of what is in neither means nor powers nor cross-spectra, which is added [nats]: counts of odd samples, waves of known
         course, biases of two levels. Lines are in the powers of their bands already, and would count twice.
+    shown : xarray.Dataset or callable, optional
+        Baseline with all effects, those of `more_gain` too, where `after` is without them: what the Allan variance is compared with.
 
     Returns
     -------
@@ -78,6 +82,8 @@ def held_out(reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain:
         models = {"before": _trained(before, ~out), "after": _trained(after, ~out)}
         gains = gains.plus(_gain(reduced, models["before"], models["after"], out))
         moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
+        if shown is not None:
+            models["after"] = _trained(shown, ~out)
         for name, baseline in models.items():
             squares[name].append(_allan_scores(reduced, baseline, held))
             squares[f"mean_{name}"].append(_mean_scores(reduced, baseline, held))
