@@ -180,9 +180,10 @@ class _Search:
         chosen, claims = self._settled(start, chosen)
         unknown = [one for one in chosen if isinstance(one, Unknown)]
         state = self._with(start, [*claims, *unknown])
-        claims, withdrawn = self._complete(start, state, claims, unknown)
+        kept, withdrawn = self._complete(start, state, claims, unknown)
         unknown += withdrawn
-        return sorted(claims, key=lambda one: -one.gain), unknown, self._with(start, [*claims, *unknown]) if withdrawn else state
+        same = len(kept) == len(claims) and not withdrawn
+        return sorted(kept, key=lambda one: -one.gain), unknown, state if same else self._with(start, [*kept, *unknown])
 
     def _counted(self, one: Claim | Unknown) -> set[str]:
         """Keys that stand for counts which are explained now: there is nothing to take out of a count."""
@@ -340,6 +341,8 @@ class _Search:
         kept, withdrawn = list(claims), []
         for axis in state.axes:
             named = _on(kept, "mean", axis)
+            part_of = _of_a_drift(named, unknown, axis)
+            kept = [one for one in kept if one not in part_of]
             if any(one.generic in ("~bias(t)", "~S(f)", "~cov") and axis in one.axes for one in unknown):
                 continue
             if any(part.candidate.effect in _SHAPES and axis in part.row for one in kept for part in one.parts):
@@ -366,6 +369,12 @@ class _Search:
 
 def _on(claims: Sequence[Claim], view: str, axis: str) -> list[Claim]:
     return [one for one in claims if any(part.candidate.view == view and part.row == (axis,) for part in one.parts)]
+
+
+def _of_a_drift(named: Sequence[Claim], unknown: Sequence[Unknown], axis: str) -> list[Claim]:
+    """Claims that a drift of no name on the same axis makes doubtful: no channel tells of them, and it brings more than they do."""
+    drift = sum(one.gain for one in unknown if one.generic == "~bias(t)" and axis in one.axes)
+    return [one for one in named if not any(one.driver) and one.gain < drift]
 
 
 def _weak(named: Sequence[Claim], left: float) -> tuple[list[Claim], float]:
