@@ -304,8 +304,9 @@ def without_odd(reduced: xr.Dataset, parts: Iterable[Part]) -> xr.Dataset:
 def _cross_without(reduced: xr.Dataset, odd: NDArray[np.bool_]) -> xr.DataArray:
     """Covariances of the pairs of axes without the blocks that are odd on either, (axis, block)."""
     axes = [str(axis) for axis in reduced["axis"].values]
-    touched = [odd[axes.index(one)] | odd[axes.index(other)] for one, other in pair_rows(reduced)]
-    return reduced["cross"].where(~xr.DataArray(np.array(touched), dims=("pair", "block")))
+    pairs = np.array([[axes.index(axis) for axis in pair] for pair in pair_rows(reduced)], np.int64).reshape(-1, 2)
+    touched = odd[pairs].any(axis=1)
+    return reduced["cross"].where(~xr.DataArray(touched, dims=("pair", "block")))
 
 
 _TAKERS = {
