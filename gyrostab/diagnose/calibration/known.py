@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.calibration.expected import NOISE, band_columns
 from gyrostab.diagnose.calibration.wandering import Wandering, told_in_full, wandering
 from gyrostab.diagnose.effects.candidates import windows_of
-from gyrostab.diagnose.effects.cells import effective, in_place, pair_rows
+from gyrostab.diagnose.effects.cells import cross_without, effective, in_place, pair_rows
 from gyrostab.diagnose.effects.response import inside_bands, response_of
 from gyrostab.diagnose.gains.lines import LEAK, expected_lines
 from gyrostab.kernels.periodogram import band_edges, ordinates, taper
@@ -158,11 +158,7 @@ def without_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Datase
         return reduced
     still = xr.DataArray(~moving, dims=("axis", "block"))
     out = reduced.assign({name: reduced[name].where(still) for name in ("power", "kurtosis") if name in reduced})
-    if "cross" not in reduced:
-        return out
-    axes = [str(axis) for axis in reduced["axis"].values]
-    both = [still.values[[axes.index(axis) for axis in pair]].all(axis=0) for pair in pair_rows(reduced)]
-    return out.assign(cross=reduced["cross"].where(xr.DataArray(np.reshape(both, (-1, moving.shape[1])), dims=("pair", "block"))))
+    return out.assign(cross=cross_without(reduced, moving)) if "cross" in reduced else out
 
 
 def _known_lines(reduced: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array) -> dict[str, Array]:

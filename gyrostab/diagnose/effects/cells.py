@@ -24,6 +24,7 @@ __all__ = [
     "begin_state",
     "cells_of",
     "cross_column",
+    "cross_without",
     "drawn",
     "effective",
     "in_place",
@@ -124,6 +125,13 @@ def _row_of(density: Array, row: int) -> Array:
 def pair_rows(reduced: xr.Dataset) -> list[tuple[str, ...]]:
     """Both axes of each pair."""
     return [(str(a), str(b)) for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)]
+
+
+def cross_without(reduced: xr.Dataset, left_out: NDArray[np.bool_]) -> xr.DataArray:
+    """Covariances of the pairs of axes without the blocks that are left out on either, (axis, block)."""
+    axes = [str(axis) for axis in reduced["axis"].values]
+    pairs = np.array([[axes.index(axis) for axis in pair] for pair in pair_rows(reduced)], np.int64).reshape(-1, 2)
+    return reduced["cross"].where(~xr.DataArray(left_out[pairs].any(axis=1), dims=("pair", "block")))
 
 
 def view_rows(candidate: Candidate, state: State) -> list[tuple[str, ...]]:

@@ -10,7 +10,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.cells import State, cross_column, harmonic_sets, order_columns, pair_rows, power_column, witness_power
+from gyrostab.diagnose.effects.cells import (
+    State,
+    cross_column,
+    cross_without,
+    harmonic_sets,
+    order_columns,
+    pair_rows,
+    power_column,
+    witness_power,
+)
 from gyrostab.diagnose.effects.response import is_filter, straightened
 from gyrostab.diagnose.gains.gain import noise_columns
 from gyrostab.diagnose.gains.lines import expected_lines, line_skirt
@@ -271,7 +280,7 @@ def _marks(state: State, part: Part) -> State:
         reduced[variable] = reduced[variable].where(keep | ~here)
     if "cross" in reduced:
         rows = np.array([one == axis for one in state.axes])
-        reduced["cross"] = _cross_without(reduced, odd & rows[:, None])
+        reduced["cross"] = cross_without(reduced, odd & rows[:, None])
     return replace(state, reduced=reduced)
 
 
@@ -298,15 +307,7 @@ def without_odd(reduced: xr.Dataset, parts: Iterable[Part]) -> xr.Dataset:
         return reduced
     there = xr.DataArray(~odd, dims=("axis", "block"))
     left = reduced.assign(mean=reduced["mean"].where(there), power=reduced["power"].where(there))
-    return left.assign(cross=_cross_without(reduced, odd)) if "cross" in reduced else left
-
-
-def _cross_without(reduced: xr.Dataset, odd: NDArray[np.bool_]) -> xr.DataArray:
-    """Covariances of the pairs of axes without the blocks that are odd on either, (axis, block)."""
-    axes = [str(axis) for axis in reduced["axis"].values]
-    pairs = np.array([[axes.index(axis) for axis in pair] for pair in pair_rows(reduced)], np.int64).reshape(-1, 2)
-    touched = odd[pairs].any(axis=1)
-    return reduced["cross"].where(~xr.DataArray(touched, dims=("pair", "block")))
+    return left.assign(cross=cross_without(reduced, odd)) if "cross" in reduced else left
 
 
 _TAKERS = {
