@@ -72,6 +72,18 @@ def test_statistics_are_those_of_raw_logs(lost):
     assert 0.0 < float(nulls["outliers"].sum(["axis", "block"]).mean()) < 5.0 * CHANCE * nulls.sizes["axis"]
 
 
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_neighbouring_bands_scatter_together_as_in_raw_logs(lost):
+    shares = []
+    for records in both(lost):
+        left = (records["power"] / records["power"].mean(["record", "block"])).transpose("band", ...).values.reshape(records.sizes["band"], -1)
+        left = left[:, np.isfinite(left).all(axis=0)]
+        shares.append(np.corrcoef(left[:10]))
+    beside = [np.mean([np.diagonal(share, apart).mean() for apart in (1, 2)]) for share in shares]
+    assert beside[1] == pytest.approx(beside[0], abs=0.006)
+    assert beside[0] > 0.01
+
+
 def test_lattices_give_repeats_zeros_and_extremes():
     record = raw(1, 0.0, lattice=0.5)
     nulls = joined(list(null_records(record, calibrate(record), count=50, rng=np.random.default_rng(1))))

@@ -11,7 +11,7 @@ from scipy import stats
 
 from gyrostab.diagnose.reduction.reduced import block_samples, reduce_log
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.periodogram import band_edges, ordinates, taper
+from gyrostab.kernels.periodogram import band_covariance, band_edges, ordinates, taper
 from gyrostab.log import make_log
 from gyrostab.noise import URAD_PER_S
 from gyrostab.simulate import simulate
@@ -87,6 +87,18 @@ def test_white_noise_has_its_density_and_the_gamma_distribution_of_the_shape(gap
     assert np.all(np.abs(spread - 1.0) < 0.13)
     for band in range(3, power.shape[1]):
         assert stats.kstest(stats.gamma.cdf(power[:, band] * shape[:, band], shape[:, band]), "uniform").pvalue > 1e-4
+
+
+def test_bands_share_scatter_as_the_taper_says():
+    size, blocks = 50, 40_000
+    x = np.random.default_rng(4).standard_normal((blocks, size))
+    spectrum = np.fft.rfft((x - x.mean(axis=1, keepdims=True)) * taper(size), axis=1)[:, 1 : ordinates(size) + 1]
+    power = np.add.reduceat(np.abs(spectrum) ** 2, band_edges(size)[:-1] - 1, axis=1)
+    found = np.cov((power / power.mean(axis=0)).T)
+    scatter = np.sqrt(np.outer(np.diag(found), np.diag(found)) / blocks)
+    np.fill_diagonal(found, 0.0)
+    assert np.abs((found - band_covariance(size)) / scatter).max() < 4.5
+    assert np.abs(found / scatter).max() > 6.0  # there is something to see
 
 
 def test_whole_blocks_lose_little_to_the_taper():

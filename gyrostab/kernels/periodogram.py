@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.compiled import INNER, KERNEL
 
 __all__ = [
+    "band_covariance",
     "band_edges",
     "band_powers",
     "block_samples",
@@ -36,6 +37,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _EXACT = 12  # ordinates of a band up to which the covariance of each pair is summed
+_APART = 16  # ordinates that the taper still correlates
 
 
 def taper(size: int, share: float = 0.2) -> Array:
@@ -204,6 +206,37 @@ def shape_of_bands(mask, squared, expected, present, edges, size):  # type: igno
                     variance += (1.0 if apart == 0 else 2.0) * (stop - first - apart) * power
             out[b, band] = mean * mean / variance if variance > 0.0 else np.nan
     return out
+
+
+def band_covariance(size: int) -> Array:
+    """Relative covariance of the powers of different bands of a whole block in white noise, (band, band); 0 on the diagonal.
+
+    The taper spreads each ordinate over its neighbours, so that bands which touch have some percent of their scatter in common.
+
+    Parameters
+    ----------
+    size : int
+        Samples of a block.
+
+    Examples
+    --------
+    >>> band_covariance(200)[2, :6].round(3)
+    array([0.027, 0.026, 0.   , 0.019, 0.012, 0.004])
+    """
+    edges, n = band_edges(size), ordinates(size)
+    expected, mask, squared = (part[0] for part in gap_spectra(np.ones((1, size), np.bool_), taper(size)))
+    squared = np.concatenate([squared, squared[1 : (size + 1) // 2][::-1].conj()])  # of all frequencies
+    band = np.searchsorted(edges, np.arange(1, n + 1), side="right") - 1
+    out = np.zeros((edges.size - 1, edges.size - 1))
+    for apart in range(1, min(_APART, n)):
+        k = np.arange(1, n + 1 - apart)
+        share = mask[k] / size
+        one = squared[apart].conj() - share * mask[k + apart].conj()
+        two = squared[2 * k + apart] - share * mask[k + apart]
+        np.add.at(out, (band[k - 1], band[k + apart - 1]), np.abs(one) ** 2 + np.abs(two) ** 2)
+    np.fill_diagonal(out, 0.0)
+    total = np.add.reduceat(expected, edges[:-1] - 1)
+    return np.asarray((out + out.T) / np.outer(total, total))
 
 
 @njit(**KERNEL)

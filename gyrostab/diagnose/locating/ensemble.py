@@ -18,7 +18,7 @@ from gyrostab.diagnose.calibration.expected import line_columns, white_variance
 from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.locating.shared import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.outliers import CHANCE, beyond_chance
-from gyrostab.kernels.periodogram import taper
+from gyrostab.kernels.periodogram import band_covariance, taper
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times, ornstein_uhlenbeck_means
 from gyrostab.noise import HOUR
 
@@ -27,6 +27,8 @@ __all__ = ["null_records"]
 Array = NDArray[np.float64]
 _CHUNK = 25
 _POOL = 10**6  # samples made one by one
+_NEXT = 2  # bands above that share scatter with one
+_COMMON = 0.9  # of the scatter of a band that it may share with others
 _COARSE = 1.5  # standard deviations: a lattice step from which on the values are few levels
 
 
@@ -36,6 +38,7 @@ class _Frame(NamedTuple):
     reduced: xr.Dataset
     baseline: xr.Dataset
     shape: Array
+    ties: list[Array]  # shape of the gamma part that each band shares with the next, and with the one after
     columns: Array
     effects: Array  # expected power over that of the noise alone
     sd: Array  # of a sample and of the difference of two neighbours, by axis
@@ -98,7 +101,21 @@ def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) 
     density = [np.column_stack([lines * square, peak]) for square, peak in zip(baseline["square"].values, peaks, strict=True)]
     tails = np.array([_tails(reduced, one, rng) for one in density])
     shape = _ordered(reduced, "shape", "axis", "block", "band")
-    return _Frame(reduced, baseline, shape, columns, effects, np.array(sd), tails, shared_by(reduced, baseline))
+    ties = _ties(_ordered(baseline, "shape_alone", "axis", "block", "band"), int(reduced.attrs["block_samples"]))
+    return _Frame(reduced, baseline, shape, ties, columns, effects, np.array(sd), tails, shared_by(reduced, baseline))
+
+
+def _ties(shape: Array, size: int) -> list[Array]:
+    """Shapes (axis, block, band) of what each band has in common with the first, second, ... band above it, as the taper makes it."""
+    covariance = band_covariance(size)
+    safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 0.0)
+    ties = [safe[..., :-apart] * safe[..., apart:] * np.diagonal(covariance, apart) for apart in range(1, _NEXT + 1)]
+    total = np.zeros_like(safe)
+    for apart, tie in enumerate(ties, start=1):
+        total[..., :-apart] += tie
+        total[..., apart:] += tie
+    least = np.divide(_COMMON * safe, total, out=np.ones_like(safe), where=total > _COMMON * safe)
+    return [tie * np.minimum(least[..., :-apart], least[..., apart:]) for apart, tie in enumerate(ties, start=1)]
 
 
 def _tails(reduced: xr.Dataset, density: Array, rng: np.random.Generator) -> tuple[float, float]:
@@ -135,7 +152,8 @@ def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
         form = _ordered(baseline, "form_shape", "axis", "band")
         expected *= _gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
     if frame.shared is None:
-        power, between = _gamma(baseline["shape_alone"].values, expected, rng), np.empty(0, np.complex128)
+        shape_alone = _ordered(baseline, "shape_alone", "axis", "block", "band")
+        power, between = _tied(shape_alone, frame.ties, expected, rng), np.empty(0, np.complex128)
     else:
         power, between = shared_spectra(frame.shared, count, rng)
         power *= expected
@@ -170,6 +188,21 @@ def _gamma(shape: Array, mean: Array, rng: np.random.Generator) -> Array:
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
     drawn = rng.standard_gamma(np.broadcast_to(safe, mean.shape)) / safe
     return np.asarray(np.where(np.isinf(shape), 1.0, drawn) * mean)
+
+
+def _tied(shape: Array, ties: list[Array], mean: Array, rng: np.random.Generator) -> Array:
+    """As `_gamma`, where bands have gamma parts in common: parts of one scale add up to what their shapes add up to."""
+    safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
+    alone = safe.copy()
+    for apart, tie in enumerate(ties, start=1):
+        alone[..., :-apart] -= tie
+        alone[..., apart:] -= tie
+    drawn = rng.standard_gamma(np.broadcast_to(alone, mean.shape))
+    for apart, tie in enumerate(ties, start=1):
+        both = rng.standard_gamma(np.broadcast_to(tie, (len(mean), *tie.shape)))
+        drawn[..., :-apart] += both
+        drawn[..., apart:] += both
+    return np.asarray(drawn / safe * mean)
 
 
 def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator) -> Array:
