@@ -76,12 +76,25 @@ def test_statistics_are_those_of_raw_logs(lost):
 def test_neighbouring_bands_scatter_together_as_in_raw_logs(lost):
     shares = []
     for records in both(lost):
-        left = (records["power"] / records["power"].mean(["record", "block"])).transpose("band", ...).values.reshape(records.sizes["band"], -1)
+        left = (
+            (records["power"] / records["power"].mean(["record", "block"])).transpose("band", ...).values.reshape(records.sizes["band"], -1)
+        )
         left = left[:, np.isfinite(left).all(axis=0)]
         shares.append(np.corrcoef(left[:10]))
     beside = [np.mean([np.diagonal(share, apart).mean() for apart in (1, 2)]) for share in shares]
     assert beside[1] == pytest.approx(beside[0], abs=0.006)
     assert beside[0] > 0.01
+
+
+def test_rare_kurtoses_are_as_rare_as_in_samples():
+    record = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute())
+    nulls = joined(list(null_records(record, calibrate(record), count=200, rng=np.random.default_rng(2))))
+    size = int(record.attrs["block_samples"])
+    samples = np.random.default_rng(3).standard_normal((50_000, size))
+    square = (samples - samples.mean(axis=1, keepdims=True)) ** 2
+    found = (square**2).mean(axis=1) / square.mean(axis=1) ** 2 - 3.0
+    for share, tolerance in ((1e-3, 0.025), (1e-2, 0.02), (0.5, 0.02), (0.99, 0.06), (0.999, 0.2)):
+        assert float(nulls["kurtosis"].quantile(share)) == pytest.approx(np.quantile(found, share), abs=tolerance)
 
 
 def test_lattices_give_repeats_zeros_and_extremes():
