@@ -36,7 +36,7 @@ from gyrostab.diagnose.effects.explained import without_odd
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import NullScores, null_scores
-from gyrostab.diagnose.modelling.expected import expected_baseline, fit_expected, without_expected
+from gyrostab.diagnose.modelling.expected_effects import expected_baseline, fit_expected, without_expected
 from gyrostab.diagnose.modelling.limits import limits
 from gyrostab.diagnose.modelling.odd_power import with_odd_power
 from gyrostab.diagnose.modelling.predict import predicted

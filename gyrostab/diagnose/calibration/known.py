@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.calibration.expected import NOISE, band_columns
+from gyrostab.diagnose.calibration.noise_statistics import NOISE, band_columns
 from gyrostab.diagnose.calibration.wandering import Wandering, told_in_full, wandering
 from gyrostab.diagnose.effects.candidates import windows_of
 from gyrostab.diagnose.effects.cells import cross_without, effective, in_place, pair_rows
