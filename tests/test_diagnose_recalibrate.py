@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from gyrostab.diagnose.naming.claims import Claim, Naming
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.simulate import simulate
 
+core = importlib.import_module("gyrostab.diagnose.core")
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 SHAKE = {"profile": "vibration", "points": [[0, 3.0], [850, 3.0], [851, 6.0], [1800, 6.0]]}
 
@@ -64,6 +66,17 @@ def test_vibration_at_two_levels_and_never_none(shaken):
     assert error < 0.2 * value
     assert abs(value - 0.003) < 3.0 * error
     assert after.attrs["recalibrated"] == ["x"]
+
+
+def test_a_diagnosis_tells_noise_and_effects_as_they_are_beside_each_other(shaken):
+    """The first calibration has the vibration in its noise, and finds less of it than there is."""
+    naming, baseline, after = shaken
+    fit = core._fitted_beside_their_noise(naming, baseline, first := fit_claims(naming, baseline))
+    assert noise_of(fit.noise, "N")[0] == noise_of(after, "N")[0] < 1.2 * 0.003
+    (size,) = fit.fitted[0].parameters.values()
+    assert size.low < 0.002 < size.high
+    held = core._worth(naming.state.reduced, baseline, naming, first)
+    assert held["misfit_after"] == pytest.approx(1.0, abs=0.15)
 
 
 def test_an_axis_without_an_effect_keeps_its_noise(shaken):
