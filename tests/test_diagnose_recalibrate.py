@@ -79,6 +79,24 @@ def test_a_diagnosis_tells_noise_and_effects_as_they_are_beside_each_other(shake
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.15)
 
 
+def test_a_size_in_shares_of_the_noise_is_one_of_the_noise_beside_it():
+    """Warm throughout, so that the first calibration has twice the noise and more, and its growth in shares of that."""
+    heat = {
+        "profile": "ramps",
+        "channel": "temperature",
+        "unit": "degC",
+        "points": [[0, 35], [600, 35], [601, 50], [1200, 50], [1201, 65], [1800, 65]],
+    }
+    reduced = reduced_of({"name": "temperature_noise", "linear": 0.05, "axes": ["x"]}, environment=[heat])
+    baseline = calibrate(reduced)
+    naming = naming_of(reduced, baseline, "temperature_noise", "power", ("linear",))
+    first = fit_claims(naming, baseline)
+    fit = core._fitted_beside_their_noise(naming, baseline, first)
+    assert first[0].parameters["linear"].high < 0.05
+    growth = fit.fitted[0].parameters["linear"].value * noise_of(fit.noise, "N")[0] ** 2
+    assert growth == pytest.approx(0.05 * 0.003**2, rel=0.1)
+
+
 def test_an_axis_without_an_effect_keeps_its_noise(shaken):
     _, baseline, after = shaken
     for name in ("coefficient", "spectrum", "square", "grid_calibrated", "mean_variance"):
