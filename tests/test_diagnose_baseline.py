@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
-from gyrostab.diagnose.calibration.expected import common_variance, noise_powers, white_variance
+from gyrostab.diagnose.calibration.noise_statistics import common_variance, noise_powers, white_variance
 from gyrostab.diagnose.calibration.quiet import quiet_blocks
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.reduction.reduced import reduce_log

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-
 import numpy as np
 import pytest
 from scipy import signal
@@ -16,7 +14,6 @@ from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.simulate import simulate
 
-core = importlib.import_module("gyrostab.diagnose.core")
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 SHAKE = {"profile": "vibration", "points": [[0, 0.02], [500, 0.02], [520, 6.0], [900, 6.0], [920, 0.02], [1500, 0.02]]}
 TURN = {"profile": "rotation", "points": [[0, 0.0], [300, 0.0], [330, 72.0], [800, 72.0], [830, 0.0], [1500, 0.0]]}

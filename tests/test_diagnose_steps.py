@@ -17,6 +17,7 @@ from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
 from tests.named import nulls, record
 
+core = importlib.import_module("gyrostab.diagnose.core")
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 JUMP = {"name": "bias_jump", "step": [2.0], "at": 807.0}  # 50 standard deviations of a block's mean; blocks begin at 800 s and 820 s
 
@@ -66,17 +67,17 @@ def test_hops_between_two_levels_leave_no_line_against_their_own_model():
 
 def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
     """The core reads the log again for its lines; what is loud in blocks that are left out does not matter then."""
-    core = importlib.import_module("gyrostab.diagnose.core")
+    task = core._Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
     reduced = reduce_log(jumped)
     baseline = calibrate(reduced)
     course = np.zeros((1, reduced.sizes["block"]))
     course[:, :12:2] = 5.0  # the first part has the blocks 0 to 11
     known = baseline.assign(known_mean=(("axis", "block"), course))
-    found = core._still_lines(jumped, reduced, known, 5.0, no_stage)
+    found = core._still_lines(task, reduced, known)
     assert found["line_weight"].values[0, 0] == 0.0
     np.testing.assert_allclose(found["line_power"][:, 2:], reduced["line_power"][:, 2:])
     xr.testing.assert_identical(found.drop_vars(["line_power", "line_weight"]), reduced.drop_vars(["line_power", "line_weight"]))
-    assert core._still_lines(jumped, reduced, baseline, 5.0, no_stage) is reduced
+    assert core._still_lines(task, reduced, baseline) is reduced
 
 
 def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_else():

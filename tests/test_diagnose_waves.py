@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -12,6 +14,8 @@ from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.naming.claims import Claim, Naming
 from gyrostab.diagnose.naming.waves import without_waves
 from gyrostab.simulate import simulate
+
+N = 0.003  # deg/sqrt(h)
 
 
 def part(view: str, gain: float) -> Part:
@@ -32,15 +36,29 @@ def test_only_waves_are_taken_out_with_what_they_gain() -> None:
     assert left.claims[1] is naming.claims[2]
 
 
-def test_a_wave_locked_to_the_rotation_is_worth_what_the_normal_law_says() -> None:
-    N, size, seconds = 0.003, 0.07, 1200.0
-    model = {
+def model(size: float, seconds: float) -> dict[str, Any]:
+    """A line at the turning of the tool on x, and a second axis with noise alone."""
+    return {
         "noise": {"N": N, "B": 0.002, "K": 0.01},
         "effect": [{"name": "rotation_line", "amplitude": size, "axes": ["x"]}],
-        "environment": [{"profile": "rotation", "points": [[0, 70.0], [600, 75.0], [1200, 72.0]]}],
+        "environment": [{"profile": "rotation", "points": [[0, 70.0], [seconds / 2.0, 75.0], [seconds, 72.0]]}],
         "log": {"axes": ["x", "y"]},
     }
-    found = diagnose(simulate(model, duration=seconds, rate=10.0, seed=4).compute(), nulls=100)
+
+
+def test_a_wave_locked_to_the_rotation_is_worth_what_the_normal_law_says() -> None:
+    size, seconds = 0.07, 1200.0
+    found = diagnose(simulate(model(size, seconds), duration=seconds, rate=10.0, seed=4).compute(), nulls=100)
     assert [one["name"] for one in found.effects] == ["rotation_line"]
-    expected = size**2 * seconds / (4.0 * 3600.0 * N**2)
-    assert found.content["held_out"]["log_likelihood_gain"] == pytest.approx(expected, rel=0.5)
+    assert found.content["held_out"]["log_likelihood_gain"] == pytest.approx(size**2 * seconds / (4.0 * 3600.0 * N**2), rel=0.5)
+
+
+def test_the_allan_variance_is_held_against_the_model_with_the_wave() -> None:
+    """The powers of the model whose gain is told are without the wave, and would fit no better than before."""
+    table = model(0.3, 600.0)
+    log = simulate(table, duration=600.0, rate=10.0, seed=4).compute()
+    found = diagnose(log, simulation={"noise": table["noise"]}, nulls=100)
+    assert [one["name"] for one in found.effects] == ["rotation_line"]
+    held = found.content["held_out"]
+    assert held["misfit_before"] > 1.5
+    assert held["misfit_after"] == pytest.approx(1.0, abs=0.2)

@@ -6,8 +6,9 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -36,12 +37,12 @@ from gyrostab.diagnose.effects.explained import without_odd
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import NullScores, null_scores
-from gyrostab.diagnose.modelling.expected import expected_baseline, fit_expected, without_expected
+from gyrostab.diagnose.modelling.expected_effects import expected_baseline, fit_expected, without_expected
 from gyrostab.diagnose.modelling.limits import limits
 from gyrostab.diagnose.modelling.odd_power import with_odd_power
 from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
-from gyrostab.diagnose.modelling.refit import fit_claims
+from gyrostab.diagnose.modelling.refit import Fitted, fit_claims
 from gyrostab.diagnose.naming.claims import Claim
 from gyrostab.diagnose.naming.levels import without_levels
 from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
@@ -127,6 +128,50 @@ def diagnose(
         return _diagnose(log, simulation, quiet, seed, nulls, false_alarm_level, block, restart_gap, progress)
 
 
+@dataclass(frozen=True)
+class _Task:
+    """A recording, and how it is to be compared.
+
+    Attributes
+    ----------
+    log : xarray.Dataset
+        With the axes that are alive.
+    given : Model, xarray.Dataset or None
+        The simulation; None where the noise is to be calibrated.
+    quiet, restart_gap, seed, nulls, level, progress
+        The options of `diagnose`; `level` is its `false_alarm_level`.
+    """
+
+    log: xr.Dataset
+    given: Model | xr.Dataset | None
+    quiet: Any
+    restart_gap: Any
+    seed: int
+    nulls: int
+    level: float
+    progress: Stage
+
+
+class _Compared(NamedTuple):
+    """What a comparison found.
+
+    Attributes
+    ----------
+    reduced : xarray.Dataset
+    baseline : xarray.Dataset
+    found : xarray.Dataset
+        Places of mismatches.
+    naming : Naming
+    null : NullScores
+    """
+
+    reduced: xr.Dataset
+    baseline: xr.Dataset
+    found: xr.Dataset
+    naming: Naming
+    null: NullScores
+
+
 def _diagnose(
     log: xr.Dataset,
     simulation: Any,
@@ -146,42 +191,54 @@ def _diagnose(
     reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
     alive = _axes_alive(reduced)
     if len(alive) < log.sizes["axis"]:
-        reduced = reduce_log(log.sel(axis=alive), block=block, restart_gap=restart_gap, progress=progress)
+        log = log.sel(axis=alive)
+        reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
         given = given.sel(axis=alive) if isinstance(given, xr.Dataset) else given
-
-    def still(reduced: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
-        return _still_lines(log.sel(axis=alive), reduced, known, restart_gap, progress)
-
-    def compared(reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset, Naming, NullScores]:
-        progress("calibrating", 0)
-        baseline = _baseline(reduced, given, quiet, restart_gap, progress)
-        if isinstance(given, Model) and (turning := known_motion(reduced, baseline)).any():
-            left = without_motion(log.sel(axis=alive), reduced, turning, restart_gap=restart_gap, progress=progress)
-            reduced = left.drop_vars("moving")  # it is accounted for
-            baseline = _baseline(reduced, given, quiet, restart_gap, progress)
-        seen = without_known_lines(reduced, baseline)
-        records = _records(seen, baseline, nulls, seed)
-        progress("comparing", 0)
-        null = null_scores(baseline, records())
-        progress("naming", 0)
-        known = _known_apart(baseline, given)
-        naming = name_effects(seen, baseline, records(), level=level / 2.0, seed=seed, known=known, progress=progress)
-        before = expected_baseline(naming, baseline)
-        apart = without_expected(still(seen, before) if naming.expected else seen, baseline, naming.expected)
-        found = locate(apart, before, null, level=level / 2.0)  # the other half is for the names
-        return reduced, baseline, unexpected(found, naming.expected, seen, before, null, level=level / 2.0), naming, null
-
-    reduced, baseline, found, naming, null = compared(reduced)
-    moving = unexplained_motion(reduced, naming.claims) if given is None else np.zeros(1, np.bool_)
-    if moving.any():
-        at_rest = without_motion(log.sel(axis=alive), reduced, moving, restart_gap=restart_gap, progress=progress)
-        try:
-            reduced, baseline, found, naming, null = compared(at_rest)
-        except SchemaError as error:
-            warnings.warn(f"compared with its motion in it, for what is at rest does not do: {error}", stacklevel=3)
+    task = _Task(log, given, quiet, restart_gap, seed, nulls, level, progress)
+    compared = _at_rest(task, _compare(task, reduced))
     progress("fitting", 0)
-    own = given if isinstance(given, Model) else None
-    return _concluded(reduced, baseline, found, naming, null, still, level=level, given=own, begun=begun)
+    return _concluded(task, compared, begun)
+
+
+def _compare(task: _Task, reduced: xr.Dataset) -> _Compared:
+    """Calibrate, draw null records, name effects, locate what is beyond chance."""
+    task.progress("calibrating", 0)
+    reduced, baseline = _calibrated(task, reduced)
+    seen = without_known_lines(reduced, baseline)
+    records = _records(seen, baseline, task.nulls, task.seed)
+    task.progress("comparing", 0)
+    null = null_scores(baseline, records())
+    task.progress("naming", 0)
+    half = task.level / 2.0  # the names have one half, the places the other
+    known = _known_apart(baseline, task.given)
+    naming = name_effects(seen, baseline, records(), level=half, seed=task.seed, known=known, progress=task.progress)
+    before = expected_baseline(naming, baseline)
+    apart = without_expected(_still_lines(task, seen, before) if naming.expected else seen, baseline, naming.expected)
+    found = unexpected(locate(apart, before, null, level=half), naming.expected, seen, before, null, level=half)
+    return _Compared(reduced, baseline, found, naming, null)
+
+
+def _calibrated(task: _Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """The record and its baseline; the record without the blocks in which a model that was given says that the rate moves."""
+    baseline = _baseline(task, reduced)
+    if isinstance(task.given, Model) and (turning := known_motion(reduced, baseline)).any():
+        left = without_motion(task.log, reduced, turning, restart_gap=task.restart_gap, progress=task.progress)
+        reduced = left.drop_vars("moving")  # it is accounted for
+        baseline = _baseline(task, reduced)
+    return reduced, baseline
+
+
+def _at_rest(task: _Task, compared: _Compared) -> _Compared:
+    """The comparison once more without the blocks of a motion that has no name; the same where there are none, or too few are left."""
+    moving = unexplained_motion(compared.reduced, compared.naming.claims) if task.given is None else np.zeros(1, np.bool_)
+    if not moving.any():
+        return compared
+    at_rest = without_motion(task.log, compared.reduced, moving, restart_gap=task.restart_gap, progress=task.progress)
+    try:
+        return _compare(task, at_rest)
+    except SchemaError as error:
+        warnings.warn(f"compared with its motion in it, for what is at rest does not do: {error}", stacklevel=4)
+        return compared
 
 
 def _check_options(nulls: int, level: float, seed: int) -> None:
@@ -222,15 +279,15 @@ def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:
             )
 
 
-def _baseline(reduced: xr.Dataset, given: xr.Dataset | Model | None, quiet: Any, restart_gap: Any, progress: Stage) -> xr.Dataset:
-    if given is None:
-        return calibrate(reduced, quiet=quiet)
-    if quiet is not None:
+def _baseline(task: _Task, reduced: xr.Dataset) -> xr.Dataset:
+    if task.given is None:
+        return calibrate(reduced, quiet=task.quiet)
+    if task.quiet is not None:
         raise OptionError("quiet says what to calibrate on; with a simulation nothing is calibrated, so leave one of the two out")
-    if isinstance(given, xr.Dataset):
+    if isinstance(task.given, xr.Dataset):
         same = f"{reduced.attrs['block_samples']}samples"
-        return from_simulation(reduced, reduce_log(given, block=same, restart_gap=restart_gap, progress=progress))
-    return from_model(reduced, given)
+        return from_simulation(reduced, reduce_log(task.given, block=same, restart_gap=task.restart_gap, progress=task.progress))
+    return from_model(reduced, task.given)
 
 
 def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -> Callable[[], Iterable[xr.Dataset]]:
@@ -252,7 +309,7 @@ def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -
     return recall
 
 
-def _still_lines(log: xr.Dataset, reduced: xr.Dataset, known: xr.Dataset, restart_gap: Any, progress: Stage) -> xr.Dataset:
+def _still_lines(task: _Task, reduced: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
     """The record with the line spectra of the blocks in which nothing that is known moves; the log is read once more where something does.
 
     A step within a block has the spectrum of a step, and a part of the record has only one for all its blocks.
@@ -261,7 +318,7 @@ def _still_lines(log: xr.Dataset, reduced: xr.Dataset, known: xr.Dataset, restar
     moving = known_motion(reduced, known)
     if not (moving & there).any():
         return reduced
-    calm = without_motion(log, reduced, moving | ~there, restart_gap=restart_gap, progress=progress)
+    calm = without_motion(task.log, reduced, moving | ~there, restart_gap=task.restart_gap, progress=task.progress)
     return without_known_lines(reduced.assign({name: calm[name] for name in ("line_power", "line_weight")}), known)
 
 
@@ -270,27 +327,66 @@ def _known_apart(baseline: xr.Dataset, given: xr.Dataset | Model | None) -> list
     return [one for one in given.effects if one.name in baseline.attrs["left_out"]] if isinstance(given, Model) else []
 
 
-def _concluded(
-    reduced: xr.Dataset,
-    baseline: xr.Dataset,
-    found: xr.Dataset,
-    naming: Naming,
-    null: NullScores,
-    still: Callable[[xr.Dataset, xr.Dataset], xr.Dataset],
-    *,
-    level: float,
-    given: Model | None,
-    begun: float,
-) -> Diagnosis:
-    """Fit what was named, see what it is worth and what is left, and put it all into one result."""
-    first = fit_claims(naming, baseline)
-    noise = recalibrate(naming, baseline, first)
-    naming, raw = (naming, naming) if noise is baseline else (with_noise(naming, noise), naming)
-    fitted = first if noise is baseline else fit_claims(naming, noise)
-    before = expected_baseline(naming, baseline)
-    after = predicted(naming, noise) if naming.claims else before
+class _Fit(NamedTuple):
+    """The effects in their final numbers.
 
-    told, hopping = without_levels(raw)
+    Attributes
+    ----------
+    naming : Naming
+        With designs for the noise below.
+    noise : xarray.Dataset
+        The baseline with the noise as it is beside the effects.
+    fitted, expected : list of Fitted
+        Effects that the simulation lacks, and those that it has as well.
+    """
+
+    naming: Naming
+    noise: xr.Dataset
+    fitted: list[Fitted]
+    expected: list[Fitted]
+
+
+def _concluded(task: _Task, compared: _Compared, begun: float) -> Diagnosis:
+    """Fit what was named, see what it is worth and what is left, and put it all into one result."""
+    reduced, baseline, naming = compared.reduced, compared.baseline, compared.naming
+    first = fit_claims(naming, baseline)
+    fit = _fitted_beside_their_noise(naming, baseline, first)
+    before = expected_baseline(fit.naming, baseline)
+    after = predicted(fit.naming, fit.noise) if naming.claims else before
+    mismatches = _mismatches(task, compared, fit, after)
+    unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
+    held = _worth(reduced, baseline, naming, first)
+    content = {
+        "schema": SCHEMA,
+        "recording": recording_table(reduced),
+        "baseline": baseline_table(baseline, fit.expected),
+        "verdict": verdict(mismatches, fit.naming.claims, unexplained),
+        "false_alarm_level": task.level,
+        "mismatches": mismatches,
+        "effects": effect_tables(fit.fitted, reduced),
+        "unexplained": unexplained,
+        "not_found": limit_tables(limits(fit.naming)),
+        "held_out": {name: held[name] for name in HELD_OUT},
+        "seconds": round(time.perf_counter() - begun, 3),
+    }
+    own = task.given if isinstance(task.given, Model) else None
+    diagnosis = Diagnosis(plain(content), _surfaces(reduced, fit, before, after), model_tables(fit.noise, fit.fitted, own))
+    check_diagnosis(diagnosis.content)
+    return diagnosis
+
+
+def _fitted_beside_their_noise(naming: Naming, baseline: xr.Dataset, first: list[Fitted]) -> _Fit:
+    """Calibrate the noise beside the effects as they were fitted `first`, and fit them once more to what is left."""
+    noise = recalibrate(naming, baseline, first)
+    if noise is baseline:
+        return _Fit(naming, baseline, first, fit_expected(naming, baseline))
+    naming = with_noise(naming, noise)
+    return _Fit(naming, noise, fit_claims(naming, noise), fit_expected(naming, baseline))
+
+
+def _worth(reduced: xr.Dataset, baseline: xr.Dataset, naming: Naming, first: Sequence[Fitted]) -> dict[str, float]:
+    """What the effects gain on time that they were not fitted to, each by the views that can tell; the noise is fitted with them."""
+    told, hopping = without_levels(naming)
     judged, waving = without_waves(told)
 
     def trained(chosen: Naming, known: NDArray[np.bool_]) -> xr.Dataset:
@@ -302,37 +398,29 @@ def _concluded(
     clean = without_odd(reduced, [*parts, *(part for claim in told.expected for part in claim.parts)])
     start = partial(expected_baseline, told, baseline) if told.expected else baseline
     whole, rest = (partial(trained, one) if one.claims else start for one in (told, judged))
-    held = held_out(clean, start, rest, more_gain=odd + hopping + waving, shown=whole if waving else None)
+    return held_out(clean, start, rest, more_gain=odd + hopping + waving, shown=whole if waving else None)
+
+
+def _mismatches(task: _Task, compared: _Compared, fit: _Fit, after: xr.Dataset) -> list[dict[str, Any]]:
+    """Places beyond chance and those of what was named, each with the effects that explain it."""
+    reduced, found, claims = compared.reduced, compared.found, fit.naming.claims
 
     def without(left_out: Sequence[Claim]) -> xr.Dataset:
-        return predicted(naming, noise, left_out=left_out)
+        return predicted(fit.naming, fit.noise, left_out=left_out)
 
-    lines = still(reduced, after) if naming.claims and (found["view"] == "spectrum").any() else None
-    explained = explanations(found, naming.claims, reduced, after, null, level=level / 2.0, without=without, still=lines)
+    lines = _still_lines(task, reduced, after) if claims and (found["view"] == "spectrum").any() else None
+    explained = explanations(found, claims, reduced, after, compared.null, level=task.level / 2.0, without=without, still=lines)
     mismatches = mismatch_tables(found, reduced, explained)
-    mismatches += claim_tables(naming, reduced, mismatches)
-    mismatches += unknown_tables(naming, reduced, mismatches)
-    mismatches += motion_tables(naming.claims, reduced, mismatches)
-    unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
-    expected = fit_expected(naming, baseline)
-    content = {
-        "schema": SCHEMA,
-        "recording": recording_table(reduced),
-        "baseline": baseline_table(baseline, expected),
-        "verdict": verdict(mismatches, naming.claims, unexplained),
-        "false_alarm_level": level,
-        "mismatches": mismatches,
-        "effects": effect_tables(fitted, reduced),
-        "unexplained": unexplained,
-        "not_found": limit_tables(limits(naming)),
-        "held_out": {name: held[name] for name in HELD_OUT},
-        "seconds": round(time.perf_counter() - begun, 3),
-    }
-    before, after = with_odd_power(before, reduced, expected), with_odd_power(after, reduced, [*expected, *fitted])
-    surfaces = surfaces_with_blocks(make_surfaces(reduced, before, after), reduced, before, after)
-    diagnosis = Diagnosis(plain(content), surfaces, model_tables(noise, fitted, given))
-    check_diagnosis(diagnosis.content)
-    return diagnosis
+    mismatches += claim_tables(fit.naming, reduced, mismatches)
+    mismatches += unknown_tables(fit.naming, reduced, mismatches)
+    return mismatches + motion_tables(claims, reduced, mismatches)
+
+
+def _surfaces(reduced: xr.Dataset, fit: _Fit, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
+    """The recording beside the simulation without and with the effects, odd samples in both of them as they are in the recording."""
+    before = with_odd_power(before, reduced, fit.expected)
+    after = with_odd_power(after, reduced, [*fit.expected, *fit.fitted])
+    return surfaces_with_blocks(make_surfaces(reduced, before, after), reduced, before, after)
 
 
 def quiet_span(text: str) -> tuple[float | str, float | str]:

@@ -13,8 +13,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.calibration.expected import NOISE, common_variance, line_columns, noise_powers, white_variance
 from gyrostab.diagnose.calibration.known import evenness, known_effects
+from gyrostab.diagnose.calibration.noise_statistics import NOISE, common_variance, line_columns, noise_powers, white_variance
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
 from gyrostab.diagnose.calibration.quiet import loudness, quiet_blocks, quiet_spans
 from gyrostab.diagnose.calibration.simulated import odd_band, shown_by, with_shown

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.calibration.expected import NOISE, band_columns
+from gyrostab.diagnose.calibration.noise_statistics import NOISE, band_columns
 from gyrostab.diagnose.calibration.wandering import Wandering, told_in_full, wandering
 from gyrostab.diagnose.effects.candidates import windows_of
 from gyrostab.diagnose.effects.cells import cross_without, effective, in_place, pair_rows
@@ -79,55 +79,149 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Known:
     SchemaError
         When the recording lacks the channel of an effect.
     """
+    acting = [_acting(effect, reduced) for effect in map(_simulated(model), model.effects)]
+    shown = [one for one in acting if not _leaves_odd_samples(one)]  # the blocks with odd samples are found, and left out
+    powers = [power for one in shown for power in _powers(one, reduced)]
+    response = _response(shown, reduced)
+    noise = np.einsum("fn,abn->abf", band_columns(reduced), np.maximum(_levels(shown, square, reduced), 0.0))
+    added = np.zeros(noise.shape)
+    for power in powers:
+        added += power.own
+    narrow = [(one.acting.effect, one.acting.rows, one.own) for one in powers if one.acting.seen.line is not None and one.factor.any()]
+    sizes = {"bands": reduced.sizes["band"], "blocks": reduced.sizes["block"], "axes": reduced.sizes["axis"]}
+    return Known(
+        mean=_means(shown, reduced),
+        spectrum=effective((noise + added) * response, reduced),
+        cross=_cross(powers, response, reduced),
+        lines=_known_lines(reduced, narrow, response[:, 0]) if narrow and "line_power" in reduced else {},
+        wandering=wandering([(_wander_squares(one, reduced), one.seen) for one in shown], **sizes),
+        left_out=[one.effect.name for one in acting if _leaves_odd_samples(one) or _shows_elsewhere(one)],
+    )
+
+
+class _Acting(NamedTuple):
+    """An effect of a model on a record.
+
+    Attributes
+    ----------
+    effect : Effect
+    rows : list of int
+        Axes that it acts on.
+    axes : tuple of str
+        Their names.
+    seen : Prediction
+        What it does there.
+    """
+
+    effect: Effect
+    rows: list[int]
+    axes: tuple[str, ...]
+    seen: Prediction
+
+
+class _Power(NamedTuple):
+    """Power that an effect adds.
+
+    Attributes
+    ----------
+    acting : _Acting
+    factor : ndarray of complex, shape (axis,)
+    density : ndarray, shape (axis, block, band)
+        For a factor of 1 [degree2 hour-2 Hz-1 per squared unit].
+    """
+
+    acting: _Acting
+    factor: NDArray[np.complex128]
+    density: Array
+
+    @property
+    def own(self) -> Array:
+        """On each axis, (axis, block, band) [degree2 hour-2 Hz-1]."""
+        return np.asarray(np.abs(self.factor[:, None, None]) ** 2 * self.density)
+
+
+def _acting(effect: Effect, reduced: xr.Dataset) -> _Acting:
     axes = [str(axis) for axis in reduced["axis"].values]
-    blocks, bands = reduced.sizes["block"], reduced.sizes["band"]
-    mean, level = np.zeros((len(axes), blocks)), np.repeat(square[:, None], blocks, axis=1)
-    added, response, left_out = np.zeros((len(axes), blocks, bands)), np.ones((len(axes), 1, bands)), []
-    pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(reduced)] if "cross" in reduced else []
-    shared = np.zeros((len(pairs), blocks, bands), np.complex128)
-    narrow: list[tuple[Effect, list[int], Array]] = []
-    random: list[tuple[dict[str, Array], Prediction]] = []
-    for effect in map(_simulated(model), model.effects):
-        rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
-        own = tuple(axes[row] for row in rows)
-        seen = _explained(effect, reduced, own)
-        if {*seen.marks} - {_IN_ALL}:  # the blocks with odd samples are found, and left out
-            left_out.append(effect.name)
-            continue
-        for name, values in seen.mean.items():
-            mean[rows] += _sizes(effect, name, own)[:, None] * values
-        for (term, name), values in seen.level.items():
-            level[rows, :, NOISE.index(term)] += square[rows, None, NOISE.index(term)] * _sizes(effect, name, own)[:, None] * values
-        for name, values in seen.spectrum.items():
-            factor = np.zeros(len(axes), np.complex128)
-            factor[rows] = _factors(effect, name, own)
-            density = np.zeros((len(axes), blocks, bands))
-            peak = _peak(effect, name, reduced, own)
-            density[rows] = values.reshape(*values.shape[:-1], bands, -1).mean(axis=-1) if peak is None else _over_bands(peak, reduced)
-            added += np.abs(factor[:, None, None]) ** 2 * density
-            for number, (one, other) in enumerate(pairs if seen.coherent else ()):
-                shared[number] += factor[one] * np.conj(factor[other]) * np.sqrt(density[one] * density[other])
-            if seen.line is not None and factor.any():
-                narrow.append((effect, rows, np.abs(factor[:, None, None]) ** 2 * density))
-        if seen.response is not None:
-            response[rows] *= response_of(effect, reduced)
-        random.append(({name: _on(rows, len(axes), _sizes(effect, name, own) ** 2) for name in seen.wander}, seen))
-        elsewhere = seen.marks or not told_in_full(seen) or seen.transfer or seen.order or seen.phase_locked
-        if elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None):
-            left_out.append(effect.name)
-    spectrum = (np.einsum("fn,abn->abf", band_columns(reduced), np.maximum(level, 0.0)) + added) * response
+    rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
+    own = tuple(axes[row] for row in rows)
+    return _Acting(effect, rows, own, _explained(effect, reduced, own))
+
+
+def _leaves_odd_samples(one: _Acting) -> bool:
+    return bool({*one.seen.marks} - {_IN_ALL})
+
+
+def _shows_elsewhere(one: _Acting) -> bool:
+    """Whether means, powers and cross-spectra do not hold all that an effect does."""
+    seen = one.seen
+    elsewhere = seen.marks or not told_in_full(seen) or seen.transfer or seen.order or seen.phase_locked
+    return bool(elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None))
+
+
+def _means(acting: Sequence[_Acting], reduced: xr.Dataset) -> Array:
+    """Rates that effects add, (axis, block) [degree hour-1]."""
+    mean = np.zeros((reduced.sizes["axis"], reduced.sizes["block"]))
+    for one in acting:
+        for name, values in one.seen.mean.items():
+            mean[one.rows] += _sizes(one.effect, name, one.axes)[:, None] * values
+    return mean
+
+
+def _levels(acting: Sequence[_Acting], square: Array, reduced: xr.Dataset) -> Array:
+    """Squared noise coefficients with what effects add to them, (axis, block, noise)."""
+    level = np.repeat(square[:, None], reduced.sizes["block"], axis=1)
+    for one in acting:
+        for (term, name), values in one.seen.level.items():
+            own = square[one.rows, None, NOISE.index(term)]
+            level[one.rows, :, NOISE.index(term)] += own * _sizes(one.effect, name, one.axes)[:, None] * values
+    return level
+
+
+def _powers(one: _Acting, reduced: xr.Dataset) -> list[_Power]:
+    """Power that an effect adds, one for each of its spectra."""
+    out, bands = [], reduced.sizes["band"]
+    for name, values in one.seen.spectrum.items():
+        factor = np.zeros(reduced.sizes["axis"], np.complex128)
+        factor[one.rows] = _factors(one.effect, name, one.axes)
+        density = np.zeros((factor.size, reduced.sizes["block"], bands))
+        peak = _peak(one.effect, name, reduced, one.axes)
+        density[one.rows] = values.reshape(*values.shape[:-1], bands, -1).mean(axis=-1) if peak is None else _over_bands(peak, reduced)
+        out.append(_Power(one, factor, density))
+    return out
+
+
+def _response(acting: Sequence[_Acting], reduced: xr.Dataset) -> Array:
+    """Share of the power that filters let pass, (axis, 1, band)."""
+    response = np.ones((reduced.sizes["axis"], 1, reduced.sizes["band"]))
+    for one in acting:
+        if one.seen.response is not None:
+            response[one.rows] *= response_of(one.effect, reduced)
+    return response
+
+
+def _cross(powers: Sequence[_Power], response: Array, reduced: xr.Dataset) -> NDArray[np.complex128] | None:
+    """Cross-spectrum of what the axes share, behind a filter (axis, 1, band), as `Known.cross` has it."""
+    if "cross" not in reduced:
+        return None
+    axes = [str(axis) for axis in reduced["axis"].values]
+    pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(reduced)]
+    shared = np.zeros((len(pairs), reduced.sizes["block"], reduced.sizes["band"]), np.complex128)
+    for power in (power for power in powers if power.acting.seen.coherent):
+        for number, (one, other) in enumerate(pairs):
+            both = power.factor[one] * np.conj(power.factor[other])
+            shared[number] += both * np.sqrt(power.density[one] * power.density[other])
     for number, (one, other) in enumerate(pairs):
         shared[number] *= np.sqrt(response[one] * response[other])
-    cross = effective(shared, reduced, "pair") if shared.any() else None
-    lines = _known_lines(reduced, narrow, response[:, 0]) if narrow and "line_power" in reduced else {}
-    return Known(mean, effective(spectrum, reduced), cross, lines, wandering(random, bands=bands, blocks=blocks, axes=len(axes)), left_out)
+    return effective(shared, reduced, "pair") if shared.any() else None
 
 
-def _on(rows: Sequence[int], axes: int, values: Array) -> Array:
-    """Values of some axes among all of them."""
-    out = np.zeros(axes)
-    out[list(rows)] = values
-    return out
+def _wander_squares(one: _Acting, reduced: xr.Dataset) -> dict[str, Array]:
+    """Squared sizes of what an effect does to the means at random, (axis,) each."""
+    squares = {}
+    for name in one.seen.wander:
+        squares[name] = np.zeros(reduced.sizes["axis"])
+        squares[name][one.rows] = _sizes(one.effect, name, one.axes) ** 2
+    return squares
 
 
 def known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:

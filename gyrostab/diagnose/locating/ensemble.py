@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from gyrostab.diagnose.calibration.expected import line_columns, white_variance
+from gyrostab.diagnose.calibration.noise_statistics import line_columns, white_variance
 from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.locating.shared import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.outliers import CHANCE, beyond_chance

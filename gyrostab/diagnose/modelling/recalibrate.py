@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.calibration.baseline import DRAWS, assemble
-from gyrostab.diagnose.calibration.expected import common_variance, noise_powers, white_variance
 from gyrostab.diagnose.calibration.known import drivers_of
+from gyrostab.diagnose.calibration.noise_statistics import common_variance, noise_powers, white_variance
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior
 from gyrostab.diagnose.effects.candidates import variants_of, windows_of
 from gyrostab.diagnose.effects.cells import State, begin_state, effective, witness_power

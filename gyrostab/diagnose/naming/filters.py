@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.calibration.expected import band_columns, common_variance
+from gyrostab.diagnose.calibration.noise_statistics import band_columns, common_variance
 from gyrostab.diagnose.calibration.posterior import Fit, expected_of
 from gyrostab.diagnose.effects.candidates import Candidate
 from gyrostab.diagnose.effects.cells import State, in_place

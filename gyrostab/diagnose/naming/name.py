@@ -20,7 +20,7 @@ from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.gains.tallies import Expected
 from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown, form_error, unknown_of, with_axes_of, with_claim
 from gyrostab.diagnose.naming.complete import flexible, redness, unrest
-from gyrostab.diagnose.naming.expected import expected_claims
+from gyrostab.diagnose.naming.expected_claims import expected_claims
 from gyrostab.diagnose.naming.filters import without_slopes
 from gyrostab.diagnose.naming.layers import found_again, layers
 from gyrostab.diagnose.naming.levels import followed_first, renewed

@@ -1,0 +1,49 @@
+"""From a log to the result: what the last steps found is in the numbers, the model and the surfaces that are handed on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gyrostab.diagnose.conclusion.result import Diagnosis
+from gyrostab.diagnose.core import diagnose
+from gyrostab.simulate import simulate
+
+N = 0.003  # deg/sqrt(h)
+
+
+@pytest.fixture(scope="module")
+def found() -> Diagnosis:
+    """Half an hour with vibration that is never still, and raises the noise of x; and with spikes on y."""
+    model = {
+        "noise": {"N": N, "B": 0.004, "K": 0.02},
+        "effect": [
+            {"name": "vibration_noise", "white": 0.002, "axes": ["x"]},
+            {"name": "spikes", "kind": "outlier", "per_hour": 60.0, "size": 60.0, "axes": ["y"]},
+        ],
+        "environment": [{"profile": "vibration", "points": [[0, 3.0], [600, 3.0], [601, 5.0], [1200, 5.0], [1201, 8.0], [1800, 8.0]]}],
+        "log": {"axes": ["x", "y"]},
+    }
+    return diagnose(simulate(model, duration="30min", rate=10.0, seed=5).compute(), nulls=100)
+
+
+def test_both_are_named(found: Diagnosis) -> None:
+    assert {one["name"]: one["axes"] for one in found.effects} == {"vibration_noise": ["x"], "spikes": ["y"]}
+
+
+def test_the_model_has_the_noise_beside_the_effects(found: Diagnosis) -> None:
+    assert found.content["baseline"]["noise"]["x"]["N"]["value"] > 1.5 * N  # that of the first calibration, which knows of none
+    assert found.model["noise"]["x"]["N"] == pytest.approx(N, rel=0.2)
+    assert found.model["noise"]["y"]["N"] == pytest.approx(N, rel=0.1)
+
+
+def test_the_surface_with_the_effects_is_that_of_the_recording(found: Diagnosis) -> None:
+    """White noise that vibration raises, on x; on y noise and spikes."""
+    short = found.surfaces["avar"].isel(tau=0)
+    recorded, after = (short.sel(case=case) for case in ("recording", "after"))
+    np.testing.assert_allclose((recorded / after).sel(axis="x").mean(), 1.0, atol=0.05)
+    np.testing.assert_allclose(recorded.sel(axis="y").mean() / after.sel(axis="y").mean(), 1.0, atol=0.3)
+
+
+def test_what_is_held_out_is_told_without_the_blocks_of_spikes(found: Diagnosis) -> None:
+    assert found.content["held_out"]["misfit_after"] == pytest.approx(1.0, abs=0.15)
