@@ -35,8 +35,8 @@ class OwnNoise:
     """Noise of a real recording.
 
     `lines` (axis, line) is its two-sided density [(deg/h)2/Hz] at the frequencies ``k rate / (2 size)``, k from 1; `level` (axis, band)
-    that in `BANDS` bands, typical in time; `logs` (axis, block, band) the logarithm of the power about blocks of `block` samples over it, NaN
-    where too much is lost; `jump` (axis,) [deg/h] the standard deviation that a single odd sample has to stand out of.
+    that in `BANDS` bands, typical in time; `logs` (axis, block, band) the logarithm of the power about blocks of `block` samples over it,
+    NaN where too much is lost; `jump` (axis,) [deg/h] the standard deviation that a single odd sample has to stand out of.
     """
 
     rate: float
