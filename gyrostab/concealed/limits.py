@@ -62,7 +62,7 @@ def mean_size(world: World, mean: Array, *, white: bool = False) -> float:
 def line_density_of(world: World, *, axis: int) -> Array:
     """Two-sided density [(deg/h)2/Hz] of the noise of an axis at the frequencies ``k rate / (2 size)``, k from 1: known, or measured."""
     if world.own is not None:
-        return world.own.lines[axis]
+        return np.asarray(world.own.lines[axis])
     f = np.arange(1, world.size) * world.rate / (2 * world.size)
     return floor_psd(f, noise=world.noise[axis], rate=world.rate)
 

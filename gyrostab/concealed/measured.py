@@ -95,13 +95,13 @@ def line_density(values: Array, *, rate: float) -> Array:
     there = np.isfinite(values)
     filled = np.where(there, values - values[there].mean(), 0.0)
     lines = fft.dct(filled, norm="ortho")[1:] ** 2 / (rate * there.mean())
-    slope = _slope(lines[:_LOW])(np.arange(1, values.size))
+    slope = _slope(lines[:_LOW])(np.arange(1.0, values.size))
     return np.asarray(slope * uniform_filter1d(lines / slope, min(_WIDE, lines.size), mode="reflect"))
 
 
 def _slope(lines: Array) -> Callable[[Array], Array]:
     """White, flicker and random walk, as a function of the number of the line, that suit the first lines best (Whittle's likelihood)."""
-    number = np.arange(1, lines.size + 1)
+    number = np.arange(1.0, lines.size + 1)
     level = float(np.median(lines)) / math.log(2.0) + 1e-300
 
     def density(logarithms: Array, k: Array) -> Array:
@@ -114,7 +114,7 @@ def _slope(lines: Array) -> Callable[[Array], Array]:
 
     starts = [(0.0, -5.0, -5.0), (0.0, 2.0, -5.0), (0.0, -5.0, 5.0)]
     best = min((minimize(misfit, start, method="Nelder-Mead", options={"maxiter": 400}) for start in starts), key=lambda one: one.fun)
-    return lambda k: density(best.x, np.asarray(k, dtype=float))
+    return lambda k: density(best.x, k)
 
 
 def _block_powers(values: Array, *, rate: float, block: int) -> Array:
