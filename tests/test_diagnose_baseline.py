@@ -8,6 +8,7 @@ import xarray as xr
 
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
 from gyrostab.diagnose.calibration.noise_statistics import common_variance, noise_powers, white_variance
+from gyrostab.diagnose.calibration.posterior import Fit, fit_squares
 from gyrostab.diagnose.calibration.quiet import quiet_blocks
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.reduction.reduced import reduce_log
@@ -199,3 +200,21 @@ def test_an_axis_without_spectra_is_named():
     reduced["power"].loc[{"axis": "y"}] = np.nan
     with pytest.raises(SchemaError, match="axis y"):
         calibrate(reduced)
+
+
+def test_noise_is_fitted_where_the_likelihood_is_largest_also_where_no_sum_of_terms_fits():
+    from scipy.optimize import minimize
+
+    f = np.array([0.025, 0.075, 0.125, 0.175, 0.225, 0.325, 0.475, 0.675, 0.975, 1.325, 1.875, 2.625, 3.675, 5.125, 7.175])
+    columns = np.stack([f**2, np.ones(f.size), 1.0 / f, 1.0 / f**2], axis=1)
+    bump = [2e4, 2e3, 700.0, 350.0, 160.0, 50.0, 11.0, 5.0, 6.0, 10.0, 19.0, 35.0, 60.0, 105.0, 31.0]  # waves below, a steep end above
+    fit = Fit(np.array(bump), columns, 26.0 * np.array([1, 1, 1, 1, 2, 3, 4, 6, 6.5, 10, 14, 19, 26, 37, 50]))
+
+    def worse(logarithms):
+        expected = columns @ np.exp(logarithms)
+        return float((fit.weight * (np.log(expected) + fit.power / expected)).sum())
+
+    rng = np.random.default_rng(0)
+    best = min(minimize(worse, rng.uniform(-5, 5, 4), method="Nelder-Mead", options={"maxiter": 4000}).fun for _ in range(8))
+    square, _ = fit_squares(fit)
+    assert worse(np.log(np.maximum(square, 1e-12))) < best + 0.1

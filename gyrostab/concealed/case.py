@@ -159,6 +159,10 @@ def _block_means(world: World, values: NDArray[np.float64]) -> list[float]:
     return [float(f"{value:.6g}") for value in np.nanmean(padded, axis=1)]
 
 
+def _learned(world: World, effect: Effect) -> float:
+    return float(effect.nats if effect.mean is None else min(effect.nats, learned_gain(world, effect.mean)))
+
+
 def _told(world: World, effect: Effect, strength: float) -> dict[str, Any]:
     waveform = {}
     if effect.mean is not None:
@@ -172,7 +176,7 @@ def _told(world: World, effect: Effect, strength: float) -> dict[str, Any]:
         "strength": float(strength),
         "size": float(effect.size),
         "expected_nats": float(effect.nats),
-        "learned_nats": float(effect.nats if effect.mean is None else min(effect.nats, learned_gain(world, effect.mean))),
+        **({} if world.own is not None else {"learned_nats": _learned(world, effect)}),  # five terms say nothing of real noise
         "tau_min_s": float(effect.tau[0]),
         "tau_max_s": float(effect.tau[1]),
         "localised": effect.active is not None,

@@ -133,8 +133,7 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
     if rng.random() < 0.3:
         shares[rng.integers(3)] = 0.0
     pairs = np.array([shares[0] * shares[1], shares[0] * shares[2], shares[1] * shares[2]])
-    rho = strength * math.sqrt(2 * NATS / ((~world.missing).sum() * (pairs**2).sum()))
-    rho = min(rho, 0.8)
+    rho = min(strength / shared_size(world, pairs), 0.8)
     shares = shares * math.sqrt(rho)
     common = _low_passed(rng, world.size, corner=corner) if coloured else rng.standard_normal(world.size)
     below = _level_below(corner) if coloured else 1.0
@@ -150,6 +149,7 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
         nats=NATS * size**2,
         tau=(1 / world.rate, 30.0),
         white=light.share_source(own, common, shares=shares),
+        common=shares[:, None] * common,
         parameters={
             "correlation": {"value": float(np.abs(rho * pairs).max()), "unit": "1"},
             "N": {
@@ -200,7 +200,8 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
 
 
 def _sample_sd(world: World, axis: int) -> float:
-    return white_level(world.noise[axis]["N"]) * math.sqrt(world.rate)
+    own = world.own
+    return white_level(world.noise[axis]["N"]) * math.sqrt(world.rate) if own is None else float(own.jump[axis])
 
 
 def spikes(world: World, rng: np.random.Generator, *, strength: float) -> Effect:

@@ -3,6 +3,10 @@
 A mean that is known up to its size, in noise of known density S(f), changes the log-likelihood by ``1/2 sum |M(f)|^2 / S(f)``; the limit
 is where that is `NATS`. In white noise and for a mean that is on for T_on of T this is ``a_min = N_s sqrt(2 c / T_eff)``. A change of the
 log variance by v in n samples is worth ``n v^2 / 4``, which gives ``2 sqrt(c / n)``; noise common to the axes ``n / 2 sum of rho^2``.
+
+In the noise of a real recording (`World.own`) the same counts against what was measured of it: S(f) is its own spectrum, lines included; a
+change of the level, which counts as far as white noise makes part of each band, stands beside what the level wanders by itself; and what
+axes share is that much less of what each has.
 """
 
 from __future__ import annotations
@@ -15,10 +19,15 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import minimize
 
-from gyrostab.concealed.floor import floor_psd
+from gyrostab.concealed.floor import floor_psd, white_level
+from gyrostab.concealed.measured import BANDS
 from gyrostab.concealed.world import World, per_second
+from gyrostab.errors import OptionError
 
-__all__ = ["NATS", "amplitude_for", "learned_gain", "mean_size", "shared_size", "variance_gain", "variance_size"]
+__all__ = [
+    "NATS", "amplitude_for", "band_density", "learned_gain", "line_density_of", "mean_size", "shared_size", "variance_gain",
+    "variance_size",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -43,23 +52,40 @@ def mean_size(world: World, mean: Array, *, white: bool = False) -> float:
         The square root of the expected log-likelihood over `NATS`.
     """
     nats = 0.0
-    for f, power, noise in _mean_lines(world, mean):
-        density = floor_psd(f, noise={"N": noise["N"]} if white else noise, rate=world.rate)
+    for axis, f, power in _mean_lines(world, mean):
+        noise = world.noise[axis]
+        density = floor_psd(f, noise={"N": noise["N"]}, rate=world.rate) if white else line_density_of(world, axis=axis)
         nats += 0.5 * float((power / density).sum())
     return math.sqrt(nats / NATS)
 
 
-def _mean_lines(world: World, mean: Array) -> Iterator[tuple[Array, Array, dict[str, float]]]:
-    """Of every axis that a mean is on: frequencies [Hz], its power there as far as it is recorded [(deg/h)2/Hz], the noise."""
+def line_density_of(world: World, *, axis: int) -> Array:
+    """Two-sided density [(deg/h)2/Hz] of the noise of an axis at the frequencies ``k rate / (2 size)``, k from 1: known, or measured."""
+    if world.own is not None:
+        return np.asarray(world.own.lines[axis])
+    f = np.arange(1, world.size) * world.rate / (2 * world.size)
+    return floor_psd(f, noise=world.noise[axis], rate=world.rate)
+
+
+def band_density(world: World, *, bands: int = BANDS) -> Array:
+    """Two-sided density [(deg/h)2/Hz] of white noise and steps of the angle in equal bands (axis, band); of real noise the typical one."""
+    if world.own is not None:
+        return world.own.level
+    f = (np.arange(bands) + 0.5) * world.rate / 2 / bands
+    return np.stack([floor_psd(f, noise={k: n[k] for k in "NQ"}, rate=world.rate) for n in world.noise])
+
+
+def _mean_lines(world: World, mean: Array) -> Iterator[tuple[int, Array, Array]]:
+    """Of every axis that a mean is on: its number, frequencies [Hz], the power there as far as it is recorded [(deg/h)2/Hz]."""
     there = ~world.missing
-    for values, noise in zip(mean, world.noise, strict=True):
+    for axis, values in enumerate(mean):
         whole = float(((values - values.mean()) ** 2).sum())
         if whole == 0:
             continue
         lines = fft.dct(values - values.mean(), norm="ortho")[1:]
         f = np.arange(1, world.size) * world.rate / (2 * world.size)
         seen = float(((values[there] - values[there].mean()) ** 2).sum()) / whole
-        yield f, seen * lines**2 / world.rate, noise
+        yield axis, f, seen * lines**2 / world.rate
 
 
 def learned_gain(world: World, mean: Array) -> float:
@@ -73,7 +99,7 @@ def learned_gain(world: World, mean: Array) -> float:
     world : World
     mean : ndarray, shape (axis, time)
     """
-    return sum(_learned(f, power, noise, world.rate) for f, power, noise in _mean_lines(world, mean))
+    return sum(_learned(f, power, world.noise[axis], world.rate) for axis, f, power in _mean_lines(world, mean))
 
 
 def _learned(f: Array, power: Array, noise: dict[str, float], rate: float) -> float:
@@ -117,6 +143,8 @@ def variance_size(world: World, ratio: Array) -> float:
     -------
     float
     """
+    if world.own is not None:
+        return math.sqrt(_own_nats(world, ratio) / NATS)
     change = np.log(ratio)
     weight = _weights(world, ratio)
     if ratio.shape[1] > 1:
@@ -126,11 +154,26 @@ def variance_size(world: World, ratio: Array) -> float:
     return math.sqrt(float((weight * change**2).sum()) / 4 / NATS)
 
 
+def _own_nats(world: World, ratio: Array) -> float:
+    """Of a change that lasts for a part of the time, in real noise [nats]."""
+    assert world.own is not None
+    if ratio.shape[1] == 1:
+        raise OptionError("what a change for good is worth in real noise nobody knows: it is there in the untouched recording too")
+    if ratio.ndim == 2:  # noise can only be added, and is white
+        white = np.array([white_level(noise["N"]) ** 2 for noise in world.noise])
+        more = ratio / ratio.min(axis=1, keepdims=True) - 1
+        ratio = 1 + more[:, :, None] * (white[:, None] / world.own.level)[:, None, :]
+    change = world.own.blocks(np.log(ratio))
+    return sum(world.own.change_nats(rows, axis=axis) for axis, rows in enumerate(change))
+
+
 def variance_gain(world: World, ratio: Array, *, quiet: bool = True) -> float:
     """Expected log-likelihood [nats] of the truth over noise without the effect, for the `ratio` of `variance_size`.
 
     Without `quiet` times, in which the noise could be seen without the effect, it is compared with the mean level instead.
     """
+    if world.own is not None:
+        return _own_nats(world, ratio)
     weight = _weights(world, ratio)
     if ratio.shape[1] == 1:
         weight = weight.sum(axis=1, keepdims=True)
@@ -140,9 +183,14 @@ def variance_gain(world: World, ratio: Array, *, quiet: bool = True) -> float:
 
 
 def shared_size(world: World, correlations: Array, *, band: float = 1.0) -> float:
-    """Size of noise common to pairs of axes with these `correlations`, over a share `band` of the frequencies."""
+    """Size of white noise common to pairs of axes (xy, xz, yz) with these `correlations`, over a share `band` of the frequencies."""
     n = float((~world.missing).sum()) * band
-    return math.sqrt(n * float((np.asarray(correlations) ** 2).sum()) / 2 / NATS)
+    worth = np.asarray(correlations) ** 2
+    if world.own is not None:  # the coherence falls where an axis has more than white noise
+        white = np.array([white_level(noise["N"]) ** 2 for noise in world.noise])
+        part = white[:, None] / world.own.level
+        worth = worth * np.array([(part[i] * part[j]).mean() for i, j in ((0, 1), (0, 2), (1, 2))])
+    return math.sqrt(n * float(worth.sum()) / 2 / NATS)
 
 
 def amplitude_for(size_of: Callable[[float], float], strength: float, *, first: float = 1.0) -> float:

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from gyrostab.concealed import tool, vibration
-from gyrostab.concealed.floor import floor_psd, white_level
+from gyrostab.concealed.floor import white_level
+from gyrostab.concealed.limits import band_density
+from gyrostab.concealed.measured import BANDS
 from gyrostab.concealed.shapes import by_axis, mean_effect, named, on_axes, variance_effect
 from gyrostab.concealed.world import AXES, QUICK, Effect, World, to_samples
 
 __all__ = ["aliased_vibration", "earth_rate", "misalignment", "rotation_line", "scale_factor", "vibration_noise", "vibration_rectification"]
 
 Array = NDArray[np.float64]
-
-_BANDS = 24
 
 
 def vibration_rectification(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -72,9 +72,9 @@ def _shaking_noise(
     form: str,
 ) -> Effect:
     shares = on_axes(rng, alone=0.4)
-    f = (np.arange(_BANDS) + 0.5) * world.rate / 2 / _BANDS
+    f = (np.arange(BANDS) + 0.5) * world.rate / 2 / BANDS
     density = vibration.folded_psd(f, rate=world.rate, kind=kind, low=band[0], high=band[1], mount=mount)
-    base = np.stack([floor_psd(f, noise={k: n[k] for k in "NQ"}, rate=world.rate) for n in world.noise])
+    base = band_density(world)
     power = np.where(world.busy, world.vibration, 0.0) ** 2
     unit = shares[:, None, None] ** 2 * power[None, :, None] * (density / base)[:, None, :]
     effect, amplitude = variance_effect(

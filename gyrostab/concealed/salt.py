@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.concealed.case import truth_of
 from gyrostab.concealed.catalogue import CATALOGUE
+from gyrostab.concealed.measured import OwnNoise, own_noise
 from gyrostab.concealed.naive import allan_variance, octaves
 from gyrostab.concealed.record import channels_of, gap_columns, with_channels
 from gyrostab.concealed.world import Effect, World, draw_world, to_samples
@@ -45,14 +46,14 @@ def rough_noise(record: Array, *, rate: float) -> dict[str, float]:
     return {"N": math.sqrt(white) / 60.0, "B": 0.0, "K": math.sqrt(3 * left / (tau[last] / 3600.0)), "Q": 0.0}
 
 
-def _world_of(log: xr.Dataset, record: Array, rng: np.random.Generator) -> World:
+def _world_of(log: xr.Dataset, record: Array, own: OwnNoise, rng: np.random.Generator) -> World:
     """The world of a real log: its own length, gaps, noise and temperature; what it does not tell is drawn."""
     rate = float(log.attrs["sampling_rate_hz"])
     world = draw_world(rng, rate=rate, seconds=record.shape[1] / rate, cuts=0)
     noise = [rough_noise(row, rate=rate) for row in record]
     noise += [noise[0]] * (3 - len(noise))
     gone = np.asarray(np.isnan(record).any(axis=0))
-    world = replace(world, size=record.shape[1], start=first_stamp(log), noise=tuple(noise[:3]), missing=gone)
+    world = replace(world, size=record.shape[1], start=first_stamp(log), noise=tuple(noise[:3]), missing=gone, own=own)
     if "temperature" in log and np.isfinite(log["temperature"].values).mean() > 0.9:
         values = np.asarray(log["temperature"].values, dtype=float)
         at = np.linspace(0, values.size - 1, world.temperature.size)
@@ -72,9 +73,8 @@ def _added(world: World, effect: Effect, rng: np.random.Generator) -> Array:
         for i, ratio in enumerate(effect.variance):
             more = np.sqrt(to_samples(world, ratio / ratio.min()) - 1 + 1e-15)
             total[i] += more * sd[i] * rng.standard_normal(world.size) if np.ptp(ratio) else 0.0
-    if effect.name == "shared_source":
-        share = math.sqrt(float(effect.parameters["correlation"]["value"]))
-        total += share * rng.standard_normal(world.size) * np.array(sd)[:, None]
+    if effect.common is not None:
+        total += effect.common * np.array(sd)[:, None]
     return total
 
 
@@ -116,7 +116,7 @@ def salt(log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator
     effect : str
         A name of the catalogue.
     strength : float
-        Size in units of the closed-form limit, by the noise of the log itself.
+        Size in units of the closed-form limit, by the noise of the log itself as `gyrostab.concealed.measured` measures it.
     rng : numpy.random.Generator
 
     Returns
@@ -173,8 +173,9 @@ def _drawn(log: xr.Dataset, record: Array, effect: str, strength: float, rng: np
     if entry.cuts:
         raise OptionError(f"{effect} follows restarts, and a real log has only its own; salt it with another effect")
     present = set("xyz"[: record.shape[0]])
+    own = own_noise(record, rate=float(log.attrs["sampling_rate_hz"]), axes=3)
     for _ in range(_TRIES):
-        world = _world_of(log, record, rng)
+        world = _world_of(log, record, own, rng)
         if entry.needs == "turning" and world.rotation.max() == 0:
             continue
         made = entry.make(world, rng, strength=strength)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from gyrostab.concealed.floor import floor_psd
-from gyrostab.concealed.limits import NATS, amplitude_for, mean_size, variance_gain, variance_size
+from gyrostab.concealed.limits import NATS, amplitude_for, line_density_of, mean_size, variance_gain, variance_size
 from gyrostab.concealed.world import AXES, Effect, World
 
 __all__ = ["by_axis", "mean_effect", "named", "on_axes", "projection", "variance_effect"]
@@ -42,8 +41,7 @@ def projection(world: World, mean: Array, driver: Array, *, axis: int) -> float:
     """Sensitivity of a mean (time,) to a driver (time,) by least squares in the noise of an axis: what a linear model should find."""
     there = ~world.missing
     x, y = (fft.dct(np.where(there, values - values[there].mean(), 0.0), norm="ortho")[1:] for values in (driver, mean))
-    f = np.arange(1, world.size) * world.rate / (2 * world.size)
-    weight = 1.0 / floor_psd(f, noise=world.noise[axis], rate=world.rate)
+    weight = 1.0 / line_density_of(world, axis=axis)
     return float((weight * x * y).sum() / (weight * x * x).sum())
 
 

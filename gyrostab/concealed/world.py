@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.concealed import environment, telemetry, tool
+from gyrostab.concealed.measured import OwnNoise
 
 __all__ = ["AXES", "QUICK", "Effect", "World", "draw_world", "per_second", "stream", "to_samples"]
 
@@ -29,6 +30,7 @@ class World:
 
     `temperature` [degC], `vibration` [g rms], `busy`, `supply` [V] and `light` (relative) hold one value a second, `rotation` [deg/s] one
     every `QUICK`; `cuts` are power cuts [s] (number, 2); `missing` tells which samples are lost; `noise` holds N, B, K, Q of every axis.
+    Where the noise is that of a real recording, `own` is what was measured of it, and limits go by that.
     """
 
     rate: float
@@ -44,6 +46,7 @@ class World:
     cuts: Array
     missing: NDArray[np.bool_]
     flicker: str = "spectrum"
+    own: OwnNoise | None = None
 
     @property
     def seconds(self) -> float:
@@ -56,8 +59,9 @@ class Effect:
     """What one effect does to the record, and what is true of it.
 
     `mean` (axis, time) [deg/h] is added; `variance` (axis, second) multiplies the white noise; `extra` (axis, time) [deg/h] is noise that
-    is added; `white` (axis, time) of unit variance stands in for the white noise; `after` is done to the
-    finished record; `size` is in units of the closed-form limit; `nats` is the likelihood that knowing the truth is expected to gain.
+    is added; `white` (axis, time) of unit variance stands in for the white noise, of which `common` is the part that axes share; `after` is
+    done to the finished record; `size` is in units of the closed-form limit; `nats` is the likelihood that knowing the truth is expected to
+    gain.
     """
 
     name: str
@@ -73,6 +77,7 @@ class Effect:
     variance: Array | None = None
     extra: Array | None = None
     white: Array | None = None
+    common: Array | None = None
     after: Callable[[Array], Array] | None = None
     ramp: Array | None = None
     lost: NDArray[np.bool_] | None = None

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 _DISAGREE = 8.0  # nats by which spectrum and means may differ about B and K
 _LEAST = 0.05  # of the expected powers, below which no size of an effect takes them
 _AT_ONCE = 64  # points of the grid
+_SHORTEST, _EVEN = 1e-3, 1e-12  # steps towards the best fit; and what rounding does to a likelihood
 _WIDE = 1e-9  # precision of what effects do to the means, against that of one of them
 
 
@@ -132,12 +133,27 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
             after = np.asarray(np.maximum(after, _LEAST * spectrum))
         if not (after > 0.0).all():
             break
-        square = np.maximum(found, 0.0)
+        part = _step(fit, spectrum, after)
+        square = square + part * (np.maximum(found, 0.0) - square)
+        after = spectrum + part * (after - spectrum)
         change = np.abs(after / spectrum - 1.0).max()
         spectrum = after
         if change < 1e-9:
             break
     return square, np.asarray(normal, dtype=np.float64), spectrum
+
+
+def _step(fit: Fit, spectrum: Array, after: Array) -> float:
+    """How far to go towards the next spectrum: all the way, or half as far until that is likelier; scoring goes too far where none fits."""
+    least = _log_likelihood(fit, spectrum)
+    part = 1.0
+    while part > _SHORTEST and _log_likelihood(fit, spectrum + part * (after - spectrum)) < least - _EVEN * abs(least):
+        part *= 0.5
+    return part
+
+
+def _log_likelihood(fit: Fit, spectrum: Array) -> float:
+    return -float((fit.weight * (np.log(spectrum) + fit.power / spectrum)).sum())
 
 
 def _without(beside: Array, precision: Array, columns: Array, power: Array, weight: Array) -> tuple[Array, Array, Array, Array]:

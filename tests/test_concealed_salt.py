@@ -1,0 +1,138 @@
+"""Salt: sized by the noise that the real recording has, not by five terms of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import fft
+from scipy.signal import lfilter
+
+from gyrostab.concealed import salt
+from gyrostab.concealed.limits import NATS, mean_size, shared_size, variance_size
+from gyrostab.concealed.measured import line_density, own_noise
+from gyrostab.concealed.record import make_log
+from gyrostab.concealed.salt import rough_noise
+from gyrostab.concealed.world import draw_world
+
+RATE, SECONDS = 20.0, 1500.0
+
+
+def white(seed: int, *, sd: float = 0.8) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0, sd, (3, round(RATE * SECONDS)))
+
+
+def world_of(record: np.ndarray):
+    world = draw_world(np.random.default_rng(1), rate=RATE, seconds=SECONDS)
+    noise = tuple(rough_noise(row, rate=RATE) | {"K": 0.0} for row in record)
+    return replace(world, noise=noise, missing=np.zeros(world.size, dtype=bool))
+
+
+def both(record: np.ndarray):
+    """A world by five terms, and the same by what is measured."""
+    world = world_of(record)
+    return world, replace(world, own=own_noise(record, rate=RATE))
+
+
+def bursts() -> np.ndarray:
+    ratio = np.ones((3, math.ceil(SECONDS) + 1))
+    ratio[1, 300:700] = 1.2
+    return ratio
+
+
+def test_in_white_noise_the_measured_limits_are_the_closed_ones():
+    plain, real = both(white(0))
+    mean = np.zeros((3, plain.size))
+    mean[1, 5000:9000] = 0.1
+    assert mean_size(real, mean) == pytest.approx(mean_size(plain, mean), rel=0.25)
+    wave = np.zeros((3, plain.size))
+    wave[2] = 0.1 * np.sin(np.arange(plain.size))
+    assert mean_size(real, wave) == pytest.approx(mean_size(plain, wave), rel=0.25)
+    assert variance_size(real, bursts()) == pytest.approx(variance_size(plain, bursts()), rel=0.2)
+    pairs = np.array([0.05, -0.03, 0.0])
+    assert shared_size(real, pairs) == pytest.approx(shared_size(plain, pairs), rel=0.1)
+
+
+@pytest.mark.parametrize("frequency", [0.05, 1.0, 8.0])
+def test_a_wave_in_coloured_noise_is_worth_its_power_over_the_density_there(frequency):
+    record = lfilter([1.0, -0.9], [1.0], white(1))  # steps of an angle, nearly: hundreds of times louder at the end of the band
+    _, real = both(record)
+    wave = np.zeros((3, real.size))
+    wave[0] = 0.05 * np.sin(2 * math.pi * frequency * np.arange(real.size) / RATE)
+    density = 0.8**2 / RATE * abs(1 - 0.9 * np.exp(-2j * math.pi * frequency / RATE)) ** 2
+    assert mean_size(real, wave) == pytest.approx(math.sqrt(0.05**2 * SECONDS / 4 / density / NATS), rel=0.2)
+
+
+def test_slow_noise_counts_at_its_slowest_lines():
+    steps = np.random.default_rng(2).normal(0, 0.01, (200, 4000))
+    found = np.mean([line_density(np.cumsum(row), rate=1.0)[:4] for row in steps], axis=0)
+    k = np.arange(1, 5)
+    np.testing.assert_allclose(found, 0.01**2 / (2 * math.pi * k / 8000) ** 2, rtol=0.5)
+
+
+def test_a_level_that_wanders_by_itself_hides_the_slow_change_and_not_the_quick_one():
+    t = np.arange(round(RATE * SECONDS)) / RATE
+    rng = np.random.default_rng(3)
+    walk = np.cumsum(rng.normal(0, 0.03, math.ceil(SECONDS) + 1))
+    plain, real = both(white(3) * np.exp(0.5 * np.interp(t, np.arange(walk.size), walk)))
+    quick = np.ones((3, walk.size))
+    quick[1] = np.where(np.arange(walk.size) // 40 % 2 == 0, 1.2, 1.0)
+    slow = np.ones_like(quick)
+    slow[1] = np.linspace(1.0, 1.4, walk.size)
+    lost = [variance_size(real, one) / variance_size(plain, one) for one in (slow, quick)]
+    assert lost[0] < 0.25 < 0.6 < lost[1]
+
+
+def test_noise_that_is_added_counts_where_the_recording_is_quiet_only():
+    record = white(4)
+    loud = np.zeros_like(record)
+    for row in range(3):  # a tenth of the band is a hundred times louder
+        lines = fft.rfft(np.random.default_rng(row).normal(0, 8.0, record.shape[1]))
+        lines[: lines.size * 9 // 10] = 0.0
+        loud[row] = fft.irfft(lines, record.shape[1])
+    (plain, _), (_, real) = both(record), both(record + loud)
+    assert variance_size(replace(real, noise=plain.noise), bursts()) == pytest.approx(
+        math.sqrt(0.9) * variance_size(plain, bursts()), rel=0.2
+    )
+
+
+def test_the_size_of_salt_is_that_in_the_noise_of_the_recording():
+    record = lfilter([1.0], [1.0, -0.98], white(5))  # its slow noise is 50 times that of the shortest times
+    log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
+    made, truth = salt(log, "vibration_rectification", 6.0, np.random.default_rng(6))["salted"]
+    mean = np.asarray(made.rate.values) - record
+    f = np.arange(1, record.shape[1]) * RATE / 2 / record.shape[1]
+    density = 0.8**2 / RATE / abs(1 - 0.98 * np.exp(-2j * math.pi * f / RATE)) ** 2
+    nats = sum(0.5 * float((fft.dct(row - row.mean(), norm="ortho")[1:] ** 2 / RATE / density).sum()) for row in mean)
+    assert math.sqrt(nats / NATS) == pytest.approx(6.0, rel=0.3)
+    assert truth["effects"][0]["size"] == 6.0
+
+
+def test_a_source_that_axes_share_is_salted_with_its_signs_and_on_its_axes_only():
+    record = white(7)
+    log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
+    two = 0
+    for seed in range(12):
+        made, truth = salt(log, "shared_source", 8.0, np.random.default_rng(seed))["salted"]
+        added = np.asarray(made.rate.values) - record
+        has = added.std(axis=1) > 0
+        assert [str(axis) for axis in made.axis.values[has]] == truth["effects"][0]["axes"]
+        tied = np.corrcoef(added[has])
+        assert np.abs(tied).min() > 0.999  # one source
+        wanted = truth["effects"][0]["parameters"]["correlation"]["value"]
+        shares = np.sort((added.std(axis=1) / 0.8)[has])
+        assert shares[-1] * shares[-2] == pytest.approx(wanted, rel=0.1)
+        two += has.sum() == 2 or bool((tied < 0).any())
+    assert two > 0
+
+
+def test_a_spike_is_salted_above_what_the_recording_throws_by_itself():
+    wild = white(8)
+    wild[:, ::997] += 9.0  # eleven standard deviations
+    calm, loud = (own_noise(record, rate=RATE).jump for record in (white(8), wild))
+    np.testing.assert_allclose(calm, 0.8, rtol=0.1)
+    assert (loud > 1.8).all()
+    _, truth = salt(make_log(wild, {}, start=1_700_000_000 * 10**9, rate=RATE), "spikes", 4.0, np.random.default_rng(9))["salted"]
+    assert truth["effects"][0]["parameters"]["spike"]["value"] > 9.0
