@@ -13,6 +13,7 @@ from gyrostab.diagnose.effects.candidates import Candidate, Variant
 from gyrostab.diagnose.effects.cells import State, cells_of, drawn, view_rows
 from gyrostab.diagnose.gains.folds import fold_subsets
 from gyrostab.diagnose.gains.gain import cell_factors, mean_factors, score
+from gyrostab.diagnose.gains.hops import Hops, hop_gain
 from gyrostab.diagnose.gains.levels import Courses, level_gains
 from gyrostab.diagnose.gains.lines import expected_lines, line_gains
 from gyrostab.diagnose.gains.tallies import (
@@ -25,10 +26,11 @@ from gyrostab.diagnose.gains.tallies import (
     kurtosis_gains,
 )
 
-__all__ = ["Found", "Tallies", "gains", "together", "totals"]
+__all__ = ["Found", "Tallies", "gains", "hops_within", "together", "totals"]
 
 Array = NDArray[np.float64]
 _PRICE = 1.5  # nats that another axis or view must bring
+_WITHIN = 2.0  # blocks that a bias stays on a level at most, where it is said to hop within them
 _MOST_BLOCKS = 20_000  # of null records that come together, in which two levels are sought on an axis
 
 
@@ -242,17 +244,37 @@ def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[
     some = data.isel(record=slice(max(1, _MOST_BLOCKS // data.sizes["block"]))) if "record" in data.dims else data
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     gain = np.full((records, len(rows)), -np.inf)
-    courses: list[Courses] = []
+    courses: list[tuple[Courses, Hops | None]] = []
     for row, axis in enumerate(state.axes):
         given = state.given.get(("mean", axis))
         found, course = level_gains(some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None)
         gain[: found.size, row] = found
-        courses.append(course)
-    return [Found(each, rows, gain, tuple(_course(each.variants[0], one, state) for one in courses)) for each in group]
+        within = hops_within(some, state, axis)
+        if within is not None:
+            gain[0, row] = max(within.gain, gain[0, row])
+        courses.append((course, within))
+    return [Found(each, rows, gain, tuple(_course(each.variants[0], *one, state) for one in courses)) for each in group]
 
 
-def _course(variant: Variant, found: Courses, state: State) -> Variant:
+def hops_within(data: xr.Dataset, state: State, axis: str) -> Hops | None:
+    """Two levels between which the bias hops within blocks; None where there are none, or where means of blocks tell as much of them."""
+    known = state.given.get(("mean", axis), [])
+    inner = state.given.get(("inner", axis), [])
+    if len(inner) < len(known):  # of what moves within blocks no more is known than its means
+        return None
+    found = hop_gain(data, state.baseline, axis=axis, given=np.stack(inner, axis=-1) if inner else None)
+    if found is None or not np.isfinite(found.gain):
+        return None
+    least, block = float(found.times.min()), float(state.reduced.attrs["block_s"])
+    return found if block / found.share.shape[1] <= least < _WITHIN * block else None  # shorter ones are spikes
+
+
+def _course(variant: Variant, found: Courses, within: Hops | None, state: State) -> Variant:
     """The variant with the course of the first record, and its mean times [s]."""
+    if within is not None:
+        low, high = within.times
+        values = {"low": float(low), "high": float(high), "hops": within.hops}
+        return replace(variant, values=values, design=within.share.mean(axis=1)[None, None], inside=within.share)
     block = float(state.reduced.attrs["block_s"])
     low, high = found.times[0] * block
     values = {"low": float(low), "high": float(high), "hops": float(found.hops[0])}

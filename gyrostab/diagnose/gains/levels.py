@@ -17,22 +17,25 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.gains.products import WIDTHS, mean_products, pairs_of, take_out
+from gyrostab.diagnose.gains.products import WIDTHS, Products, mean_products, pairs_of, take_out
 from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.kernels.evidence import mixed_evidence
 from gyrostab.kernels.levels import level_tables, levels_smooth
 
-__all__ = ["Courses", "level_courses", "level_gains"]
+__all__ = ["HOPS", "Courses", "course_evidence", "level_courses", "level_gains", "waves"]
 
 Array = NDArray[np.float64]
-#: Parts of a block, each on one level.
-PARTS = 4
+#: Parts of a block, each on one level; and so many at most, where a part of the step would stand out of the noise of a mean.
+PARTS, MOST_PARTS = 4, 64
 #: Hops that it takes: one or two are jumps.
 HOPS = 5.0
 _SHORTEST, _FIRST = 0.5, 5.0  # blocks: the shortest mean time on a level, and the one that the search begins with
-_STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))  # quantiles of the means that may be levels
+#: Quantiles of the means that may be levels.
+STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
 _TRIAL, _ROUNDS, _STILL = 3, 14, 0.01
+_COARSE = 1.0  # standard deviations of a mean that a part of the step may be
 _DRIFTS = (0, 8)  # waves of a drift
+_FINER = tuple(PARTS * 2**k for k in range(1, 5))  # parts of a block, up to MOST_PARTS
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,14 @@ class Courses:
     cost: Array
 
 
-def level_courses(values: Array, variance: Array, present: NDArray[np.bool_], beside: Array) -> Courses:
+def level_courses(
+    values: Array,
+    variance: Array,
+    present: NDArray[np.bool_],
+    beside: Array,
+    *,
+    starts: Sequence[tuple[float, float]] = STARTS,
+) -> Courses:
     """Courses of biases of two levels in white noise, by expectation and maximisation from several starts.
 
     Parameters
@@ -74,6 +84,8 @@ def level_courses(values: Array, variance: Array, present: NDArray[np.bool_], be
         Blocks that are used.
     beside : ndarray, shape (block, column)
         Columns of free size, the first of them constant.
+    starts : sequence of (float, float)
+        Quantiles of the means that may be the levels.
 
     Examples
     --------
@@ -86,27 +98,45 @@ def level_courses(values: Array, variance: Array, present: NDArray[np.bool_], be
     y = np.where(present, values.T, 0.0)
     weight = np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0)
     plain = np.linalg.lstsq(beside * np.sqrt(weight)[:, None], (y * np.sqrt(weight)).T, rcond=None)[0].T
-    level = np.quantile((y - plain @ beside.T)[:, present], np.unique(_STARTS), axis=1)
+    level = np.quantile((y - plain @ beside.T)[:, present], np.unique(starts), axis=1)
     tried = []
-    for start in _STARTS:
-        first, last = (level[int(np.searchsorted(np.unique(_STARTS), one))] for one in start)
+    for start in starts:
+        first, last = (level[int(np.searchsorted(np.unique(starts), one))] for one in start)
         size = np.concatenate([plain, (last - first)[:, None]], axis=1)
         size[:, 0] += first
         fit = _Fit(size, np.full((len(y), 2), _FIRST), np.ones(len(y)))
         tried.append(_improved(fit, y, weight, beside, _TRIAL))
     chosen = np.argmax([log for _, log in tried], axis=0)
-    best = _Fit(*(_picked([getattr(fit, item.name) for fit, _ in tried], chosen) for item in fields(_Fit)))
+    best = _Fit(*(_picked([getattr(fit, name) for fit, _ in tried], chosen) for name in ("size", "times", "scale")))
     best, _ = _improved(best, y, weight, beside, _ROUNDS)
-    return _told(best, y, weight, beside)
+    told = _told(best, y, weight, beside)
+    needed = np.abs(best.size[:, -1]) * np.sqrt(np.median(weight[present])) / _COARSE if present.any() else np.zeros(len(y))
+    for parts in _FINER:
+        rows = np.flatnonzero((needed > parts // 2) & ((needed <= parts) | (parts == MOST_PARTS)))
+        if rows.size:
+            finer = _Fit(best.size[rows], best.times[rows], np.ones(rows.size), parts)
+            finer, _ = _improved(finer, y[rows], weight, beside, _ROUNDS)
+            told = _replaced(told, rows, _told(finer, y[rows], weight, beside))
+    return told
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Sizes of the columns and of the step (record, column), mean times (record, 2), and the scale of the noise (record,)."""
+    """Sizes of the columns and of the step (record, column), mean times (record, 2), the scale of the noise (record,); parts of a block."""
 
     size: Array
     times: Array
     scale: Array
+    parts: int = PARTS
+
+
+def _replaced(told: Courses, rows: NDArray[np.int64], anew: Courses) -> Courses:
+    """The courses, with those of some records anew."""
+    out = {}
+    for item in fields(Courses):
+        out[item.name] = getattr(told, item.name).copy()
+        out[item.name][rows] = getattr(anew, item.name)
+    return Courses(**out)
 
 
 def _picked(several: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
@@ -118,10 +148,10 @@ def _smoothed(fit: _Fit, y: Array, weight: Array, beside: Array) -> tuple[Array,
     """Log likelihood, share and its square, steps up, and the sum of squares over the white variance."""
     left = y - fit.size[:, :-1] @ beside.T
     step = fit.size[:, -1]
-    levels = step[:, None, None] * np.arange(PARTS + 1) / PARTS
+    levels = step[:, None, None] * np.arange(fit.parts + 1) / fit.parts
     log = -0.5 * (weight / fit.scale[:, None])[..., None] * (left[..., None] - levels) ** 2
     most = log.max(axis=2)
-    chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], PARTS)
+    chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], fit.parts)
     start = fit.times / fit.times.sum(axis=1, keepdims=True)
     found, share, square, up = levels_smooth(np.exp(log - most[..., None]), chance, rises, start)
     seen = weight > 0.0
@@ -149,7 +179,7 @@ def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int) ->
         down = np.maximum(up + share[:, 0] - share[:, -1], 0.0)
         times = np.stack([(n - high + 0.5) / (up + 0.5), (high + 0.5) / (down + 0.5)], axis=1)
         moved = np.abs(size - fit.size).max()
-        fit = _Fit(size, np.clip(times, _SHORTEST, n), np.maximum(total / count, 1.0))
+        fit = _Fit(size, np.clip(times, _SHORTEST * PARTS / fit.parts, n), np.maximum(total / count, 1.0), fit.parts)
         log, share, square, up, total = _smoothed(fit, y, weight, beside)
         if moved < still:
             break
@@ -216,8 +246,8 @@ def level_gains(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Arr
     log_weight = baseline["grid_prior"].sel(axis=axis).values
     safe = np.where(present[:, None], values, 0.0)
     tried = []
-    for waves in _DRIFTS:
-        found = level_courses(safe, variance, present, np.concatenate([_waves(n, waves), own], axis=1))
+    for count in _DRIFTS:
+        found = level_courses(safe, variance, present, np.concatenate([waves(n, count), own], axis=1))
         worth = _worth(found, safe, own, frame, grid, log_weight) - np.log(len(_DRIFTS))
         tried.append((np.where(found.hops >= HOPS, worth, -np.inf), found))
     chosen = np.argmax([gain for gain, _ in tried], axis=0)
@@ -225,7 +255,7 @@ def level_gains(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Arr
     return _picked([gain for gain, _ in tried], chosen), best
 
 
-def _waves(n: int, count: int) -> Array:
+def waves(n: int, count: int) -> Array:
     """A constant, and slow waves that stand for a drift while the course is sought."""
     return np.asarray(np.cos(np.pi * (np.arange(n)[:, None] + 0.5) / n * np.arange(count + 1)))
 
@@ -245,14 +275,30 @@ def _worth(found: Courses, values: Array, given: Array, frame: dict[str, Any], g
     weight = log_weight - np.logaddexp.reduce(log_weight)
     out = np.empty(records)
     for r in range(records):
-        base = (weight - 0.5 * (products.square[:, r] + products.log_determinant))[None]
-        unit = 1.0 / np.sqrt(max(usual[r] + scatter[r], 1e-300))
-        rotated = (products.cross[:, r, r] * unit)[None, None, :, None]
-        eigenvalues = ((products.gram[:, r, r] + scatter[r]) * unit**2)[None, :, None]
-        out[r] = _evidence(base, rotated, eigenvalues) - np.logaddexp.reduce(base[0])
+        none, two = course_evidence(products, r, scatter[r], weight, unit=usual[r])
+        out[r] = two - none
     return out - found.cost
 
 
-def _evidence(base: Array, rotated: Array, eigenvalues: Array) -> float:
-    """Of the step, whose prior has the widths of all factors."""
-    return float(mixed_evidence(base, np.ascontiguousarray(rotated), np.maximum(eigenvalues, 0.0), np.square(WIDTHS))[0, 0])
+def course_evidence(products: Products, place: int, scatter: float, log_weight: Array, *, unit: float) -> tuple[float, float]:
+    """Logarithms of the evidence of no course and of one, over a grid of the noise.
+
+    Parameters
+    ----------
+    products : Products
+        Of records and courses, in the same number.
+    place : int
+        Of the record and its course.
+    scatter : float
+        Of the course, over the white variance.
+    log_weight : ndarray, shape (grid,)
+        Of the grid points.
+    unit : float
+        Square of the course over the white variance; the prior of the step has the widths of all factors.
+    """
+    base = (log_weight - 0.5 * (products.square[:, place] + products.log_determinant))[None]
+    size = 1.0 / np.sqrt(max(unit + scatter, 1e-300))
+    rotated = np.ascontiguousarray((products.cross[:, place, place] * size)[None, None, :, None])
+    eigenvalues = np.maximum((products.gram[:, place, place] + scatter) * size**2, 0.0)[None, :, None]
+    two = float(mixed_evidence(base, rotated, eigenvalues, np.square(WIDTHS))[0, 0])
+    return float(np.logaddexp.reduce(base[0])), two
