@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 #: Nats by which two levels must be better than normal noise of any spectrum.
 NORMAL = 10.0
 _ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that stands for it
-_MOST = 40_000  # means that a course is sought in; where there are more of them they are put together
+_MOST = 12_000  # means that a course is sought in; where there are more of them they are put together
 _LEAST = 0.5  # of the samples of a mean that must be there
-_SCALES = (1.0, 2.0, 4.0)  # of the white variance
+_OF_SQUARE, _NEXT = 0.455, 1.15  # median of the square of a normal number; between white levels that are tried
 _AT_ONCE = 500  # blocks whose spectra are worked out at once
 # quantiles of the means that may be levels: excursions may be rare
 _STARTS = ((0.05, 0.95), (0.25, 0.75), (0.25, 0.99), (0.01, 0.75), (0.5, 0.999), (0.001, 0.5))
@@ -127,7 +127,8 @@ def _worth(
     columns = np.concatenate([found.share.T, given], axis=1)
     beside = given.shape[1]
     logs: dict[str, list[float]] = {"none": [], "two": []}
-    for scale in _SCALES:
+    scales = _scales(found, values[:, 0], variance, present)
+    for scale in scales:
         white = {**base, "variance": variance * scale}
         plain = mean_products(values, columns, **white)
         wide = np.diag(np.maximum(np.diagonal(plain.gram[0])[1:], 1e-300)) / WIDTHS[-1] ** 2
@@ -137,7 +138,7 @@ def _worth(
         none, two = course_evidence(take_out(plain, beside, wide), 0, scatter, prior, unit=unit)
         logs["none"].append(none)
         logs["two"].append(two)
-    none, two = (float(np.logaddexp.reduce(logs[name])) - np.log(len(_SCALES)) for name in ("none", "two"))
+    none, two = (float(np.logaddexp.reduce(logs[name])) - np.log(scales.size) for name in ("none", "two"))
     two -= float(found.cost[0])
     return two - none if two - _normal_log(values[:, 0], variance, present, given) > NORMAL else -np.inf
 
@@ -168,14 +169,24 @@ def _normal_log(values: Array, variance: Array, present: NDArray[np.bool_], give
 
 
 def _slow(baseline: xr.Dataset) -> tuple[Array, Array, Array]:
-    """Random walks of the grid, with the flicker that goes best with each, and the logarithm of their weight."""
-    K, B, likely, free = (baseline[f"grid_{name}"].values for name in ("K", "B", "calibrated", "prior"))
-    chosen = []
-    for one in np.unique(K):
-        mine = np.flatnonzero(one == K)
-        chosen.append(mine[int(np.argmax(likely[mine]))])
-    prior = free[chosen]
-    return K[chosen], B[chosen], prior - np.logaddexp.reduce(prior)
+    """Random walks of the grid without flicker, and the least flicker without a walk, with the logarithms of their weights.
+
+    Which of them is likely is left open: what was calibrated may be mostly the hops.
+    """
+    K, B, free = (baseline[f"grid_{name}"].values for name in ("K", "B", "prior"))
+    least = np.min(B, where=B > 0.0, initial=np.inf)
+    chosen = (B == 0.0) | ((K == 0.0) & (B == least))
+    return K[chosen], B[chosen], free[chosen] - np.logaddexp.reduce(free[chosen])
+
+
+def _scales(found: Courses, values: Array, variance: Array, present: NDArray[np.bool_]) -> Array:
+    """White levels that are tried, over the expected one: that, more, and what the differences of neighbours with and without a course say."""
+    both = present[1:] & present[:-1]
+    seen = [1.0, 2.0, 4.0]
+    for left in (values, values - found.step[0] * found.share[0]):
+        square = np.diff(left)[both] ** 2 / (variance[1:] + variance[:-1])[both]
+        seen += [float(np.mean(square)), *(float(np.median(square)) / _OF_SQUARE * np.array([1.0 / _NEXT, 1.0, _NEXT]))]
+    return np.unique(np.maximum(seen, 1e-12))
 
 
 def hop_powers(share: Array, size: int, rate: float) -> Array:
