@@ -40,7 +40,7 @@ from gyrostab.diagnose.modelling.expected import expected_baseline, fit_expected
 from gyrostab.diagnose.modelling.limits import limits
 from gyrostab.diagnose.modelling.odd_power import with_odd_power
 from gyrostab.diagnose.modelling.predict import predicted
-from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise, without_hops
 from gyrostab.diagnose.modelling.refit import fit_claims
 from gyrostab.diagnose.naming.claims import Claim
 from gyrostab.diagnose.naming.levels import without_levels
@@ -152,9 +152,9 @@ def _diagnose(
     def still(reduced: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
         return _still_lines(log.sel(axis=alive), reduced, known, restart_gap, progress)
 
-    def compared(reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset, Naming, NullScores]:
+    def compared(reduced: xr.Dataset, noise: xr.Dataset | None = None) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset, Naming, NullScores]:
         progress("calibrating", 0)
-        baseline = _baseline(reduced, given, quiet, restart_gap, progress)
+        baseline = _baseline(reduced, given, quiet, restart_gap, progress) if noise is None else noise
         if isinstance(given, Model) and (turning := known_motion(reduced, baseline)).any():
             left = without_motion(log.sel(axis=alive), reduced, turning, restart_gap=restart_gap, progress=progress)
             reduced = left.drop_vars("moving")  # it is accounted for
@@ -179,6 +179,9 @@ def _diagnose(
             reduced, baseline, found, naming, null = compared(at_rest)
         except SchemaError as error:
             warnings.warn(f"compared with its motion in it, for what is at rest does not do: {error}", stacklevel=3)
+    noise = without_hops(naming, baseline)
+    if noise is not baseline:
+        reduced, baseline, found, naming, null = compared(reduced, noise)
     progress("fitting", 0)
     own = given if isinstance(given, Model) else None
     return _concluded(reduced, baseline, found, naming, null, still, level=level, given=own, begun=begun)

@@ -119,7 +119,8 @@ def _hopping(state: State, part: Part) -> State:
     axis = part.row[0]
     row = state.axes.index(axis)
     attrs = state.reduced.attrs
-    power = hop_powers(inside, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"]))
+    low, high = (float(part.variant.values[name]) for name in ("low", "high"))
+    power = hop_powers(inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"]))
     state = with_hops(state, part)
     state = state.with_columns("power", axis, [power_column(power[None], row, state)])
     moves = xr.DataArray(np.ptp(inside, axis=1) > _HOPS, dims="block") & (state.reduced["axis"] == axis)

@@ -13,9 +13,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.gains.levels import HOPS, Courses, course_evidence, level_courses, waves
+from gyrostab.diagnose.gains.levels import HOPS, MOST_PARTS, Courses, course_evidence, level_courses, waves
 from gyrostab.diagnose.gains.products import WIDTHS, mean_products, take_out
 from gyrostab.kernels.periodogram import band_edges, band_powers, gap_spectra, ordinates, taper
+from gyrostab.physics.lorentz import lorentz_density
 
 __all__ = ["Hops", "hop_gain", "hop_powers"]
 
@@ -25,7 +26,9 @@ NORMAL = 10.0
 _ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that stands for it
 _MOST = 12_000  # means that a course is sought in; where there are more of them they are put together
 _LEAST = 0.5  # of the samples of a mean that must be there
+_QUIETEST = 1e-4  # of the expected white variance
 _OF_SQUARE, _NEXT = 0.455, 1.15  # median of the square of a normal number; between white levels that are tried
+_TOLD = 0.4  # periods of a wave in a piece, up to which pieces tell it
 _AT_ONCE = 500  # blocks whose spectra are worked out at once
 # quantiles of the means that may be levels: excursions may be rare
 _STARTS = ((0.05, 0.95), (0.25, 0.75), (0.25, 0.99), (0.01, 0.75), (0.5, 0.999), (0.001, 0.5))
@@ -86,7 +89,9 @@ def hop_gain(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array 
     own = np.empty((n, 0)) if given is None else _grouped(given, together).reshape(n, -1)
     best: Hops | None = None
     for count in (0, 8):
-        found = level_courses(flat, variance, present, np.concatenate([waves(n, count), own], axis=1), starts=_STARTS)
+        found = level_courses(
+            flat, variance, present, np.concatenate([waves(n, count), own], axis=1), starts=_STARTS, least=_QUIETEST, parts=MOST_PARTS
+        )
         gain = _worth(found, flat, variance, present, own, step, baseline.sel(axis=axis)) - np.log(2.0)
         share = np.repeat(found.share[0].reshape(shape), together, axis=1)
         one = Hops(gain if found.hops[0] >= HOPS else -np.inf, share, found.times[0] * step, float(found.hops[0]))
@@ -175,12 +180,12 @@ def _slow(baseline: xr.Dataset) -> tuple[Array, Array, Array]:
     """
     K, B, free = (baseline[f"grid_{name}"].values for name in ("K", "B", "prior"))
     least = np.min(B, where=B > 0.0, initial=np.inf)
-    chosen = (B == 0.0) | ((K == 0.0) & (B == least))
+    chosen = (B == 0.0) | ((K == 0.0) & (least == B))
     return K[chosen], B[chosen], free[chosen] - np.logaddexp.reduce(free[chosen])
 
 
 def _scales(found: Courses, values: Array, variance: Array, present: NDArray[np.bool_]) -> Array:
-    """White levels that are tried, over the expected one: that, more, and what the differences of neighbours with and without a course say."""
+    """White levels that are tried, over the expected one: that, more, and what differences of neighbours say with a course and without."""
     both = present[1:] & present[:-1]
     seen = [1.0, 2.0, 4.0]
     for left in (values, values - found.step[0] * found.share[0]):
@@ -189,13 +194,17 @@ def _scales(found: Courses, values: Array, variance: Array, present: NDArray[np.
     return np.unique(np.maximum(seen, 1e-12))
 
 
-def hop_powers(share: Array, size: int, rate: float) -> Array:
+def hop_powers(share: Array, low: float, high: float, size: int, rate: float) -> Array:
     """Band powers within blocks of a bias of two levels, for a step of one.
+
+    At frequencies that pieces tell, those of the course; beyond, those of hops at random instants, as many as each block has.
 
     Parameters
     ----------
     share : ndarray, shape (block, piece)
         Of each piece on the upper level.
+    low, high : float
+        Mean times on both levels [s].
     size : int
         Samples of a block.
     rate : float
@@ -209,7 +218,7 @@ def hop_powers(share: Array, size: int, rate: float) -> Array:
     Examples
     --------
     >>> share = np.repeat([[0.0, 1.0], [1.0, 1.0]], 8, axis=1)
-    >>> (hop_powers(share, 200, 10.0).round(2)[:, 0] > 1.0)
+    >>> hop_powers(share, 20.0, 20.0, 200, 10.0).round(2)[:, 0] > 1.0
     array([ True, False])
     """
     weights, edges = taper(size), band_edges(size)
@@ -221,7 +230,11 @@ def hop_powers(share: Array, size: int, rate: float) -> Array:
         spectra = np.fft.rfft(wave * weights, axis=1)[:, 1 : ordinates(size) + 1]
         place = np.zeros(len(spectra), np.int64)
         out[first : first + len(spectra)] = band_powers(spectra, spectra, expected, place, edges, rate).real
-    return out
+    frequency = (edges[:-1] + edges[1:] - 1) / 2.0 * rate / size
+    moves = np.abs(np.diff(share.ravel(), prepend=share[0, 0])).reshape(share.shape).sum(axis=1)
+    usual = low * high / (low + high) ** 2 * lorentz_density(frequency, low * high / (low + high), rate)
+    beyond = moves[:, None] / max(float(moves.mean()), 1e-300) * usual
+    return np.where(frequency < _TOLD * rate * share.shape[1] / size, out, beyond)
 
 
 def _wave(share: Array, blocks: slice, size: int) -> Array:

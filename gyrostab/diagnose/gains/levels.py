@@ -71,6 +71,8 @@ def level_courses(
     beside: Array,
     *,
     starts: Sequence[tuple[float, float]] = STARTS,
+    least: float = 1.0,
+    parts: int = PARTS,
 ) -> Courses:
     """Courses of biases of two levels in white noise, by expectation and maximisation from several starts.
 
@@ -86,6 +88,10 @@ def level_courses(
         Columns of free size, the first of them constant.
     starts : sequence of (float, float)
         Quantiles of the means that may be the levels.
+    least : float
+        Of the white variance, that the scatter may be.
+    parts : int
+        Of a block, at least.
 
     Examples
     --------
@@ -105,17 +111,18 @@ def level_courses(
         size = np.concatenate([plain, (last - first)[:, None]], axis=1)
         size[:, 0] += first
         fit = _Fit(size, np.full((len(y), 2), _FIRST), np.ones(len(y)))
-        tried.append(_improved(fit, y, weight, beside, _TRIAL))
+        tried.append(_improved(fit, y, weight, beside, _TRIAL, least))
     chosen = np.argmax([log for _, log in tried], axis=0)
     best = _Fit(*(_picked([getattr(fit, name) for fit, _ in tried], chosen) for name in ("size", "times", "scale")))
-    best, _ = _improved(best, y, weight, beside, _ROUNDS)
+    best, _ = _improved(best, y, weight, beside, _ROUNDS, least)
     told = _told(best, y, weight, beside)
-    needed = np.abs(best.size[:, -1]) * np.sqrt(np.median(weight[present])) / _COARSE if present.any() else np.zeros(len(y))
-    for parts in _FINER:
-        rows = np.flatnonzero((needed > parts // 2) & ((needed <= parts) | (parts == MOST_PARTS)))
+    needed = np.full(len(y), float(parts))
+    needed = np.maximum(needed, np.abs(best.size[:, -1]) * np.sqrt(np.median(weight[present])) / _COARSE) if present.any() else needed
+    for more in _FINER:
+        rows = np.flatnonzero((needed > more // 2) & ((needed <= more) | (more == MOST_PARTS)))
         if rows.size:
-            finer = _Fit(best.size[rows], best.times[rows], np.ones(rows.size), parts)
-            finer, _ = _improved(finer, y[rows], weight, beside, _ROUNDS)
+            finer = _Fit(best.size[rows], best.times[rows], np.ones(rows.size), more)
+            finer, _ = _improved(finer, y[rows], weight, beside, _ROUNDS, least)
             told = _replaced(told, rows, _told(finer, y[rows], weight, beside))
     return told
 
@@ -160,7 +167,7 @@ def _smoothed(fit: _Fit, y: Array, weight: Array, beside: Array) -> tuple[Array,
     return found, share, square, up, away @ weight
 
 
-def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int) -> tuple[_Fit, Array]:
+def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, least: float) -> tuple[_Fit, Array]:
     """Expectation and maximisation, until nothing moves; and the log likelihood."""
     n, count = y.shape[1], int((weight > 0.0).sum())
     still = _STILL / np.sqrt(np.median(weight[weight > 0.0]))
@@ -179,7 +186,7 @@ def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int) ->
         down = np.maximum(up + share[:, 0] - share[:, -1], 0.0)
         times = np.stack([(n - high + 0.5) / (up + 0.5), (high + 0.5) / (down + 0.5)], axis=1)
         moved = np.abs(size - fit.size).max()
-        fit = _Fit(size, np.clip(times, _SHORTEST * PARTS / fit.parts, n), np.maximum(total / count, 1.0), fit.parts)
+        fit = _Fit(size, np.clip(times, _SHORTEST * PARTS / fit.parts, n), np.maximum(total / count, least), fit.parts)
         log, share, square, up, total = _smoothed(fit, y, weight, beside)
         if moved < still:
             break
