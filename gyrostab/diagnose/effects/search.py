@@ -250,6 +250,8 @@ def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[
         found, course = level_gains(some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None)
         gain[: found.size, row] = found
         within = hops_within(some, state, axis)
+        if within is not None and within.times.min() > _WITHIN * float(state.reduced.attrs["block_s"]) and within.gain < found[0]:
+            within = None  # means of blocks tell as much
         if within is not None:
             gain[0, row] = max(within.gain, gain[0, row])
         courses.append((course, within))
@@ -266,7 +268,7 @@ def hops_within(data: xr.Dataset, state: State, axis: str) -> Hops | None:
     if found is None or not np.isfinite(found.gain):
         return None
     least, block = float(found.times.min()), float(state.reduced.attrs["block_s"])
-    return found if block / found.share.shape[1] <= least < _WITHIN * block else None  # shorter ones are spikes
+    return found if least >= block / found.share.shape[1] else None  # shorter ones are spikes
 
 
 def _course(variant: Variant, found: Courses, within: Hops | None, state: State) -> Variant:

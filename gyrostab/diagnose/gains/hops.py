@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.gains.levels import HOPS, MOST_PARTS, Courses, course_evidence, level_courses, waves
+from gyrostab.diagnose.gains.levels import HOPS, Courses, course_evidence, level_courses, usual_courses, waves
 from gyrostab.diagnose.gains.products import WIDTHS, mean_products, take_out
 from gyrostab.kernels.periodogram import band_edges, band_powers, gap_spectra, ordinates, taper
 from gyrostab.physics.lorentz import lorentz_density
@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 NORMAL = 10.0
 _ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that stands for it
 _MOST = 12_000  # means that a course is sought in; where there are more of them they are put together
+_PARTS = 64  # of a piece, each on one level
+_BETWEEN = 0.1  # share of a piece
+_DRAWN, _BELOW, _SHAPE = 16, 4.0, 0.2  # records drawn; deviations below their likelihood, and nats for each hop, that are let pass
 _LEAST = 0.5  # of the samples of a mean that must be there
 _QUIETEST = 1e-4  # of the expected white variance
 _OF_SQUARE, _NEXT = 0.455, 1.15  # median of the square of a normal number; between white levels that are tried
@@ -89,14 +92,33 @@ def hop_gain(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array 
     own = np.empty((n, 0)) if given is None else _grouped(given, together).reshape(n, -1)
     best: Hops | None = None
     for count in (0, 8):
-        found = level_courses(
-            flat, variance, present, np.concatenate([waves(n, count), own], axis=1), starts=_STARTS, least=_QUIETEST, parts=MOST_PARTS
-        )
+        beside = np.concatenate([waves(n, count), own], axis=1)
+        found = level_courses(flat, variance, present, beside, starts=_STARTS, least=_QUIETEST, parts=_PARTS)
         gain = _worth(found, flat, variance, present, own, step, baseline.sel(axis=axis)) - np.log(2.0)
         share = np.repeat(found.share[0].reshape(shape), together, axis=1)
-        one = Hops(gain if found.hops[0] >= HOPS else -np.inf, share, found.times[0] * step, float(found.hops[0]))
+        good = found.hops[0] >= HOPS and np.isfinite(gain) and _like_two_levels(found, variance, present)
+        one = Hops(gain if good else -np.inf, share, found.times[0] * step, float(found.hops[0]))
         best = one if best is None or one.gain > best.gain else best
     return best
+
+
+def _like_two_levels(found: Courses, variance: Array, present: NDArray[np.bool_]) -> bool:
+    """Whether the bias is between the levels as rarely as one is that hops like this.
+
+    More levels, or a wave, are followed as well by hops that are fast enough; but shares of neighbouring pieces are not alike then.
+    """
+    log, share = usual_courses(found, variance, present, parts=_PARTS, count=_DRAWN, rng=np.random.default_rng(0))
+    alike = _alike(share)
+    return bool(
+        found.log[0] > log.mean() - _BELOW * log.std() - _SHAPE * float(found.hops[0])
+        and _alike(found.share)[0] < alike.mean() + _BELOW * max(float(alike.std()), 1.0)
+    )
+
+
+def _alike(share: Array) -> Array:
+    """Number of neighbouring pieces (record,) that are as long on the upper level, and neither always nor never."""
+    between = (share > _BETWEEN) & (share < 1.0 - _BETWEEN)
+    return np.asarray((between[:, 1:] & between[:, :-1] & (np.abs(np.diff(share, axis=1)) < _BETWEEN)).sum(axis=1))
 
 
 def _pieces(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple[Array, Array, int]:

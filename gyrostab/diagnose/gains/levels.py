@@ -22,20 +22,18 @@ from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.kernels.evidence import mixed_evidence
 from gyrostab.kernels.levels import level_tables, levels_smooth
 
-__all__ = ["HOPS", "Courses", "course_evidence", "level_courses", "level_gains", "waves"]
+__all__ = ["HOPS", "Courses", "course_evidence", "level_courses", "level_gains", "usual_courses", "waves"]
 
 Array = NDArray[np.float64]
-#: Parts of a block, each on one level; and so many at most, where a part of the step would stand out of the noise of a mean.
-PARTS, MOST_PARTS = 4, 64
+#: Parts of a block, each on one level.
+PARTS = 4
 #: Hops that it takes: one or two are jumps.
 HOPS = 5.0
 _SHORTEST, _FIRST = 0.5, 5.0  # blocks: the shortest mean time on a level, and the one that the search begins with
 #: Quantiles of the means that may be levels.
 STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
 _TRIAL, _ROUNDS, _STILL = 3, 14, 0.01
-_COARSE = 1.0  # standard deviations of a mean that a part of the step may be
 _DRIFTS = (0, 8)  # waves of a drift
-_FINER = tuple(PARTS * 2**k for k in range(1, 5))  # parts of a block, up to MOST_PARTS
 
 
 @dataclass(frozen=True)
@@ -54,6 +52,10 @@ class Courses:
         Expected number.
     cost : ndarray, shape (record,)
         Of saying the course [nats].
+    log : ndarray, shape (record,)
+        Logarithm of the likelihood of the means, white noise and all.
+    scale : ndarray, shape (record,)
+        Scatter over the white variance.
     """
 
     share: Array
@@ -62,6 +64,8 @@ class Courses:
     times: Array
     hops: Array
     cost: Array
+    log: Array
+    scale: Array
 
 
 def level_courses(
@@ -116,14 +120,9 @@ def level_courses(
     best = _Fit(*(_picked([getattr(fit, name) for fit, _ in tried], chosen) for name in ("size", "times", "scale")))
     best, _ = _improved(best, y, weight, beside, _ROUNDS, least)
     told = _told(best, y, weight, beside)
-    needed = np.full(len(y), float(parts))
-    needed = np.maximum(needed, np.abs(best.size[:, -1]) * np.sqrt(np.median(weight[present])) / _COARSE) if present.any() else needed
-    for more in _FINER:
-        rows = np.flatnonzero((needed > more // 2) & ((needed <= more) | (more == MOST_PARTS)))
-        if rows.size:
-            finer = _Fit(best.size[rows], best.times[rows], np.ones(rows.size), more)
-            finer, _ = _improved(finer, y[rows], weight, beside, _ROUNDS, least)
-            told = _replaced(told, rows, _told(finer, y[rows], weight, beside))
+    if parts > PARTS:
+        finer, _ = _improved(_Fit(best.size, best.times, np.ones(len(y)), parts), y, weight, beside, _ROUNDS, least)
+        told = _told(finer, y, weight, beside)
     return told
 
 
@@ -135,15 +134,6 @@ class _Fit:
     times: Array
     scale: Array
     parts: int = PARTS
-
-
-def _replaced(told: Courses, rows: NDArray[np.int64], anew: Courses) -> Courses:
-    """The courses, with those of some records anew."""
-    out = {}
-    for item in fields(Courses):
-        out[item.name] = getattr(told, item.name).copy()
-        out[item.name][rows] = getattr(anew, item.name)
-    return Courses(**out)
 
 
 def _picked(several: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
@@ -208,7 +198,47 @@ def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> Courses:
         times=np.where(turned[:, None], fit.times[:, ::-1], fit.times),
         hops=hops,
         cost=expected - log + _unknown(hops, y.shape[1]),
+        log=log,
+        scale=fit.scale,
     )
+
+
+def usual_courses(
+    found: Courses, variance: Array, present: NDArray[np.bool_], *, parts: int, count: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Logarithms of the likelihood (record,), and shares (record, block), that means of two levels have that hop as it was found.
+
+    Parameters
+    ----------
+    found : Courses
+        Of one record.
+    variance, present
+        As for `level_courses`.
+    parts : int
+        Of a block.
+    count : int
+        Records that are drawn.
+    """
+    n, (low, high) = present.size, found.times[0]
+    share = np.stack([_drawn_course(n, low, high, rng) for _ in range(count)])
+    noise = np.sqrt(variance * found.scale[0]) * rng.standard_normal(share.shape)
+    y = np.where(present, found.step[0] * share + noise, 0.0)
+    size = np.tile([0.0, found.step[0]], (count, 1))
+    fit = _Fit(size, np.tile(found.times[0], (count, 1)), np.full(count, found.scale[0]), parts)
+    return _smoothed(fit, y, np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0), np.ones((n, 1)))[:2]
+
+
+def _drawn_course(n: int, low: float, high: float, rng: np.random.Generator) -> Array:
+    """Share of n blocks on the upper level, for mean times on both levels [blocks]."""
+    first = int(rng.random() < high / (low + high))
+    pairs = 16 + int(2.0 * n / (low + high))
+    mean = np.array([low, high])[(np.arange(2 * pairs) + first) % 2]
+    at, up = [0.0], [0.0]
+    while at[-1] < n:
+        stay = rng.exponential(mean)
+        at += list(at[-1] + np.cumsum(stay))
+        up += list(up[-1] + np.cumsum(stay * ((np.arange(2 * pairs) + first) % 2)))
+    return np.diff(np.interp(np.arange(n + 1.0), at, up))
 
 
 def _unknown(hops: Array, blocks: int) -> Array:
