@@ -30,7 +30,11 @@ __all__ = ["Found", "Tallies", "gains", "hops_within", "together", "totals"]
 
 Array = NDArray[np.float64]
 _PRICE = 1.5  # nats that another axis or view must bring
-_WITHIN = 2.0  # blocks that a bias stays on a level at most, where it is said to hop within them
+_WITHIN, _LONG = (
+    2.0,
+    3.0,
+)  # blocks that a bias stays on a level at most, where pieces of blocks know it better; and where they can refute it
+_STEP = 16.0  # standard deviations of a block's mean, above which four parts of a block are too few for its course
 _MOST_BLOCKS = 20_000  # of null records that come together, in which two levels are sought on an axis
 
 
@@ -249,26 +253,44 @@ def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[
         given = state.given.get(("mean", axis))
         found, course = level_gains(some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None)
         gain[: found.size, row] = found
-        within = hops_within(some, state, axis)
-        if within is not None and within.times.min() > _WITHIN * float(state.reduced.attrs["block_s"]) and within.gain < found[0]:
-            within = None  # means of blocks tell as much
+        within, refuted = _within(some, state, axis, course, float(found[0]))
+        if refuted:
+            gain[0, row] = -np.inf
         if within is not None:
             gain[0, row] = max(within.gain, gain[0, row])
         courses.append((course, within))
     return [Found(each, rows, gain, tuple(_course(each.variants[0], *one, state) for one in courses)) for each in group]
 
 
+def _within(data: xr.Dataset, state: State, axis: str, course: Courses, gain: float) -> tuple[Hops | None, bool]:
+    """Hops within blocks, where these tell more than the means of blocks do; and whether they say that there are not two levels."""
+    found, block = _hops(data, state, axis), float(state.reduced.attrs["block_s"])
+    if found is None:
+        return None, False
+    if not _resolved(found, block):
+        return None, found.refuted and float(course.times[0].min()) < _LONG
+    deviation = float(np.sqrt(np.nanmedian(state.baseline["mean_variance"].sel(axis=axis).values)))
+    coarse = np.isfinite(gain) and float(course.step[0]) < _STEP * deviation
+    return (None if coarse and found.times.min() > _WITHIN * block else found), False
+
+
 def hops_within(data: xr.Dataset, state: State, axis: str) -> Hops | None:
-    """Two levels between which the bias hops within blocks; None where there are none, or where means of blocks tell as much of them."""
-    known = state.given.get(("mean", axis), [])
-    inner = state.given.get(("inner", axis), [])
-    if len(inner) < len(known):  # of what moves within blocks no more is known than its means
+    """Two levels between which the bias hops within blocks; None where there are none."""
+    found = _hops(data, state, axis)
+    return found if found is not None and _resolved(found, float(state.reduced.attrs["block_s"])) else None
+
+
+def _resolved(found: Hops, block: float) -> bool:
+    """Whether pieces of blocks of so many seconds tell two levels; what is shorter than a piece is a spike."""
+    return bool(np.isfinite(found.gain)) and float(found.times.min()) >= block / found.share.shape[1]
+
+
+def _hops(data: xr.Dataset, state: State, axis: str) -> Hops | None:
+    """What pieces of blocks say; None where more is named in the means of blocks than is known of their pieces."""
+    known, inner = (state.given.get((view, axis), []) for view in ("mean", "inner"))
+    if len(inner) < len(known):
         return None
-    found = hop_gain(data, state.baseline, axis=axis, given=np.stack(inner, axis=-1) if inner else None)
-    if found is None or not np.isfinite(found.gain):
-        return None
-    least, block = float(found.times.min()), float(state.reduced.attrs["block_s"])
-    return found if least >= block / found.share.shape[1] else None  # shorter ones are spikes
+    return hop_gain(data, state.baseline, axis=axis, given=np.stack(inner, axis=-1) if inner else None)
 
 
 def _course(variant: Variant, found: Courses, within: Hops | None, state: State) -> Variant:

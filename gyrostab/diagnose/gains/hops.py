@@ -7,7 +7,7 @@ levels have to do better too than normal noise of any spectrum, which includes G
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -22,7 +22,7 @@ __all__ = ["Hops", "hop_gain", "hop_powers"]
 
 Array = NDArray[np.float64]
 #: Nats by which two levels must be better than normal noise of any spectrum.
-NORMAL = 10.0
+NORMAL, _SURE = 10.0, 20.0
 _ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that stands for it
 _MOST = 12_000  # means that a course is sought in; where there are more of them they are put together
 _PARTS = 64  # of a piece, each on one level
@@ -52,12 +52,15 @@ class Hops:
         Mean times on the lower and on the upper level [s].
     hops : float
         Expected number.
+    refuted : bool
+        The pieces do better with two levels than with white noise and a walk, but it is not two levels that they have.
     """
 
     gain: float
     share: Array
     times: Array
     hops: float
+    refuted: bool = False
 
 
 def hop_gain(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None) -> Hops | None:
@@ -94,11 +97,14 @@ def hop_gain(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array 
     for count in (0, 8):
         beside = np.concatenate([waves(n, count), own], axis=1)
         found = level_courses(flat, variance, present, beside, starts=_STARTS, least=_QUIETEST, parts=_PARTS)
-        gain = _worth(found, flat, variance, present, own, step, baseline.sel(axis=axis)) - np.log(2.0)
+        gain, beyond = _worth(found, flat, variance, present, own, step, baseline.sel(axis=axis))
+        gain -= np.log(2.0)
         share = np.repeat(found.share[0].reshape(shape), together, axis=1)
-        good = found.hops[0] >= HOPS and np.isfinite(gain) and _like_two_levels(found, variance, present)
-        one = Hops(gain if good else -np.inf, share, found.times[0] * step, float(found.hops[0]))
-        best = one if best is None or one.gain > best.gain else best
+        seen = found.hops[0] >= HOPS and gain > 0.0
+        alike = seen and _like_two_levels(found, variance, present)
+        good, refuted = alike and beyond > NORMAL, seen and gain > _SURE and (not alike or beyond < -_SURE)
+        one = Hops(gain if good else -np.inf, share, found.times[0] * step, float(found.hops[0]), bool(refuted))
+        best = one if best is None or one.gain > best.gain else replace(best, refuted=best.refuted and one.refuted)
     return best
 
 
@@ -147,8 +153,8 @@ def _grouped(given: Array, together: int) -> Array:
 
 def _worth(
     found: Courses, values: Array, variance: Array, present: NDArray[np.bool_], given: Array, step: float, baseline: xr.Dataset
-) -> float:
-    """Evidence of the course over that of noise; -inf where normal noise of any spectrum does as well."""
+) -> tuple[float, float]:
+    """Evidence of the course over that of white noise with a walk, and over that of normal noise of any spectrum [nats]."""
     K, B, prior = _slow(baseline)
     base = {"step": step, "K": K, "B": B, "present": present}
     columns = np.concatenate([found.share.T, given], axis=1)
@@ -167,7 +173,7 @@ def _worth(
         logs["two"].append(two)
     none, two = (float(np.logaddexp.reduce(logs[name])) - np.log(scales.size) for name in ("none", "two"))
     two -= float(found.cost[0])
-    return two - none if two - _normal_log(values[:, 0], variance, present, given) > NORMAL else -np.inf
+    return two - none, two - _normal_log(values[:, 0], variance, present, given)
 
 
 def _normal_log(values: Array, variance: Array, present: NDArray[np.bool_], given: Array) -> float:

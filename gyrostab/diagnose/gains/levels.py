@@ -32,7 +32,7 @@ HOPS = 5.0
 _SHORTEST, _FIRST = 0.5, 5.0  # blocks: the shortest mean time on a level, and the one that the search begins with
 #: Quantiles of the means that may be levels.
 STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
-_TRIAL, _ROUNDS, _STILL = 3, 14, 0.01
+_TRIAL, _ROUNDS, _MANY_ROUNDS, _STILL = 3, 14, 60, 0.01
 _DRIFTS = (0, 8)  # waves of a drift
 
 
@@ -121,7 +121,7 @@ def level_courses(
     best, _ = _improved(best, y, weight, beside, _ROUNDS, least)
     told = _told(best, y, weight, beside)
     if parts > PARTS:
-        finer, _ = _improved(_Fit(best.size, best.times, np.ones(len(y)), parts), y, weight, beside, _ROUNDS, least)
+        finer, _ = _improved(_Fit(best.size, best.times, np.ones(len(y)), parts), y, weight, beside, _MANY_ROUNDS, least)
         told = _told(finer, y, weight, beside)
     return told
 
@@ -176,9 +176,10 @@ def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, le
         down = np.maximum(up + share[:, 0] - share[:, -1], 0.0)
         times = np.stack([(n - high + 0.5) / (up + 0.5), (high + 0.5) / (down + 0.5)], axis=1)
         moved = np.abs(size - fit.size).max()
+        slow = rounds == _MANY_ROUNDS and np.abs(np.log(times / fit.times)).max() > _STILL
         fit = _Fit(size, np.clip(times, _SHORTEST * PARTS / fit.parts, n), np.maximum(total / count, least), fit.parts)
         log, share, square, up, total = _smoothed(fit, y, weight, beside)
-        if moved < still:
+        if moved < still and not slow:
             break
     return fit, log
 
