@@ -198,7 +198,7 @@ def _normal_log(values: Array, variance: Array, present: NDArray[np.bool_], give
         log = -0.5 * used * (1.0 + np.log(np.mean((y[there] - lags[there] @ factor) ** 2)))
         log -= 0.5 * others.sum() * (1.0 + np.log(np.mean(y[others] ** 2))) if others.any() else 0.0
         best = max(best, float(log) - 0.5 * order * np.log(n))
-    return best + constant
+    return float(best + constant)
 
 
 def _slow(baseline: xr.Dataset) -> tuple[Array, Array, Array]:

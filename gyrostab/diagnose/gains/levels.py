@@ -117,7 +117,8 @@ def level_courses(
         fit = _Fit(size, np.full((len(y), 2), _FIRST), np.ones(len(y)))
         tried.append(_improved(fit, y, weight, beside, _TRIAL, least))
     chosen = np.argmax([log for _, log in tried], axis=0)
-    best = _Fit(*(_picked([getattr(fit, name) for fit, _ in tried], chosen) for name in ("size", "times", "scale")))
+    size, times, scale = (_picked([getattr(fit, name) for fit, _ in tried], chosen) for name in ("size", "times", "scale"))
+    best = _Fit(size, times, scale)
     best, _ = _improved(best, y, weight, beside, _ROUNDS, least)
     told = _told(best, y, weight, beside)
     if parts > PARTS:
