@@ -41,7 +41,7 @@ from gyrostab.diagnose.modelling.expected_effects import expected_baseline, fit_
 from gyrostab.diagnose.modelling.limits import limits
 from gyrostab.diagnose.modelling.odd_power import with_odd_power
 from gyrostab.diagnose.modelling.predict import predicted
-from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise, without_hops
 from gyrostab.diagnose.modelling.refit import Fitted, fit_claims
 from gyrostab.diagnose.naming.claims import Claim
 from gyrostab.diagnose.naming.levels import without_levels
@@ -195,15 +195,13 @@ def _diagnose(
         reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
         given = given.sel(axis=alive) if isinstance(given, xr.Dataset) else given
     task = _Task(log, given, quiet, restart_gap, seed, nulls, level, progress)
-    compared = _at_rest(task, _compare(task, reduced))
+    compared = _beside_hops(task, _at_rest(task, _compare(task, *_calibrated(task, reduced))))
     progress("fitting", 0)
     return _concluded(task, compared, begun)
 
 
-def _compare(task: _Task, reduced: xr.Dataset) -> _Compared:
-    """Calibrate, draw null records, name effects, locate what is beyond chance."""
-    task.progress("calibrating", 0)
-    reduced, baseline = _calibrated(task, reduced)
+def _compare(task: _Task, reduced: xr.Dataset, baseline: xr.Dataset) -> _Compared:
+    """Draw null records, name effects, locate what is beyond chance."""
     seen = without_known_lines(reduced, baseline)
     records = _records(seen, baseline, task.nulls, task.seed)
     task.progress("comparing", 0)
@@ -220,6 +218,7 @@ def _compare(task: _Task, reduced: xr.Dataset) -> _Compared:
 
 def _calibrated(task: _Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """The record and its baseline; the record without the blocks in which a model that was given says that the rate moves."""
+    task.progress("calibrating", 0)
     baseline = _baseline(task, reduced)
     if isinstance(task.given, Model) and (turning := known_motion(reduced, baseline)).any():
         left = without_motion(task.log, reduced, turning, restart_gap=task.restart_gap, progress=task.progress)
@@ -235,10 +234,16 @@ def _at_rest(task: _Task, compared: _Compared) -> _Compared:
         return compared
     at_rest = without_motion(task.log, compared.reduced, moving, restart_gap=task.restart_gap, progress=task.progress)
     try:
-        return _compare(task, at_rest)
+        return _compare(task, *_calibrated(task, at_rest))
     except SchemaError as error:
         warnings.warn(f"compared with its motion in it, for what is at rest does not do: {error}", stacklevel=4)
         return compared
+
+
+def _beside_hops(task: _Task, compared: _Compared) -> _Compared:
+    """The comparison once more with the noise calibrated beside hops within blocks; the same where there are none."""
+    baseline = without_hops(compared.naming, compared.baseline)
+    return compared if baseline is compared.baseline else _compare(task, compared.reduced, baseline)
 
 
 def _check_options(nulls: int, level: float, seed: int) -> None:

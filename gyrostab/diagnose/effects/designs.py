@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,8 @@ class Variant:
         Of a random mean: the time constant of its memory [s], inf for a walk.
     weight : float
         Chance of this point before the data are seen, against those of the other variants of the candidate.
+    inside : ndarray, shape (block, piece)
+        For levels: the share of pieces of the blocks on the upper level, where the bias hops within blocks; empty where it does not.
     """
 
     values: Mapping[str, Any]
@@ -48,6 +50,7 @@ class Variant:
     squared: bool = False
     time: float = np.inf
     weight: float = 1.0
+    inside: Array = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True)

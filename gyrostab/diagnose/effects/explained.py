@@ -22,6 +22,7 @@ from gyrostab.diagnose.effects.cells import (
 )
 from gyrostab.diagnose.effects.response import is_filter, straightened
 from gyrostab.diagnose.gains.gain import noise_columns
+from gyrostab.diagnose.gains.hops import hop_powers
 from gyrostab.diagnose.gains.lines import expected_lines, line_skirt
 from gyrostab.physics.phase import fold
 
@@ -36,6 +37,7 @@ __all__ = [
     "reweighted",
     "take_part",
     "take_parts",
+    "with_hops",
     "without_odd",
     "without_turns",
 ]
@@ -47,6 +49,7 @@ _LINE_REACH = 3  # lines on each side of one that belong to it
 _FEW = 0.5  # of the blocks at most may be masked
 _ODD = 0.75  # of them may be left out for odd samples
 _FLAT = 0.04  # of a density, by which its bands may differ where it is white
+_HOPS = 0.05  # share of a piece, by which a course that hops within a block differs in it
 _TURN = 0.2  # change of the logarithm of the noise power from block to block
 
 
@@ -106,6 +109,29 @@ def _mean(state: State, part: Part) -> State:
     columns = mean_columns(part.variant, row)
     state = state.with_columns("mean", axis, columns)
     return replace(state, masked=state.masked | _edges(state, row, columns))
+
+
+def _hopping(state: State, part: Part) -> State:
+    """A bias of two levels; where it hops within blocks its course is the power there, and their kurtosis says nothing."""
+    inside = part.variant.inside
+    if not inside.size:
+        return _mean(state, part)
+    axis = part.row[0]
+    row = state.axes.index(axis)
+    attrs = state.reduced.attrs
+    low, high = (float(part.variant.values[name]) for name in ("low", "high"))
+    power = hop_powers(inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"]))
+    state = with_hops(state, part)
+    state = state.with_columns("power", axis, [power_column(power[None], row, state)])
+    moves = xr.DataArray(np.ptp(inside, axis=1) > _HOPS, dims="block") & (state.reduced["axis"] == axis)
+    blank = {name: state.reduced[name].where(~moves, other) for name, other in (("kurtosis", np.nan), ("outliers", 0))}
+    return replace(state, reduced=state.reduced.assign(blank))
+
+
+def with_hops(state: State, part: Part) -> State:
+    """The state with the course of a bias that hops within blocks, in the means of blocks and of their pieces."""
+    axis = part.row[0]
+    return state.with_columns("mean", axis, mean_columns(part.variant, 0)).with_columns("inner", axis, [part.variant.inside])
 
 
 def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
@@ -319,7 +345,7 @@ _TAKERS = {
     "transfer": _transfer,
     "line": _line,
     "marks": _marks,
-    "levels": _mean,
+    "levels": _hopping,
 }
 
 

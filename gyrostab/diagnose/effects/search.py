@@ -13,6 +13,7 @@ from gyrostab.diagnose.effects.candidates import Candidate, Variant
 from gyrostab.diagnose.effects.cells import State, cells_of, drawn, view_rows
 from gyrostab.diagnose.gains.folds import fold_subsets
 from gyrostab.diagnose.gains.gain import cell_factors, mean_factors, score
+from gyrostab.diagnose.gains.hops import Hops, hop_gain
 from gyrostab.diagnose.gains.levels import Courses, level_gains
 from gyrostab.diagnose.gains.lines import expected_lines, line_gains
 from gyrostab.diagnose.gains.tallies import (
@@ -25,10 +26,15 @@ from gyrostab.diagnose.gains.tallies import (
     kurtosis_gains,
 )
 
-__all__ = ["Found", "Tallies", "gains", "together", "totals"]
+__all__ = ["Found", "Tallies", "gains", "hops_within", "together", "totals"]
 
 Array = NDArray[np.float64]
 _PRICE = 1.5  # nats that another axis or view must bring
+_WITHIN, _LONG = (
+    2.0,
+    3.0,
+)  # blocks that a bias stays on a level at most, where pieces of blocks know it better; and where they can refute it
+_STEP = 16.0  # standard deviations of a block's mean, above which four parts of a block are too few for its course
 _MOST_BLOCKS = 20_000  # of null records that come together, in which two levels are sought on an axis
 
 
@@ -242,17 +248,57 @@ def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[
     some = data.isel(record=slice(max(1, _MOST_BLOCKS // data.sizes["block"]))) if "record" in data.dims else data
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     gain = np.full((records, len(rows)), -np.inf)
-    courses: list[Courses] = []
+    courses: list[tuple[Courses, Hops | None]] = []
     for row, axis in enumerate(state.axes):
         given = state.given.get(("mean", axis))
         found, course = level_gains(some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None)
         gain[: found.size, row] = found
-        courses.append(course)
-    return [Found(each, rows, gain, tuple(_course(each.variants[0], one, state) for one in courses)) for each in group]
+        within, refuted = _within(some, state, axis, course, float(found[0]))
+        if refuted:
+            gain[0, row] = -np.inf
+        if within is not None:
+            gain[0, row] = max(within.gain, gain[0, row])
+        courses.append((course, within))
+    return [Found(each, rows, gain, tuple(_course(each.variants[0], *one, state) for one in courses)) for each in group]
 
 
-def _course(variant: Variant, found: Courses, state: State) -> Variant:
+def _within(data: xr.Dataset, state: State, axis: str, course: Courses, gain: float) -> tuple[Hops | None, bool]:
+    """Hops within blocks, where these tell more than the means of blocks do; and whether they say that there are not two levels."""
+    found, block = _hops(data, state, axis), float(state.reduced.attrs["block_s"])
+    if found is None:
+        return None, False
+    if not _resolved(found, block):
+        return None, found.refuted and float(course.times[0].min()) < _LONG
+    deviation = float(np.sqrt(np.nanmedian(state.baseline["mean_variance"].sel(axis=axis).values)))
+    coarse = np.isfinite(gain) and float(course.step[0]) < _STEP * deviation
+    return (None if coarse and found.times.min() > _WITHIN * block else found), False
+
+
+def hops_within(data: xr.Dataset, state: State, axis: str) -> Hops | None:
+    """Two levels between which the bias hops within blocks; None where there are none."""
+    found = _hops(data, state, axis)
+    return found if found is not None and _resolved(found, float(state.reduced.attrs["block_s"])) else None
+
+
+def _resolved(found: Hops, block: float) -> bool:
+    """Whether pieces of blocks of so many seconds tell two levels; what is shorter than a piece is a spike."""
+    return bool(np.isfinite(found.gain)) and float(found.times.min()) >= block / found.share.shape[1]
+
+
+def _hops(data: xr.Dataset, state: State, axis: str) -> Hops | None:
+    """What pieces of blocks say; None where more is named in the means of blocks than is known of their pieces."""
+    known, inner = (state.given.get((view, axis), []) for view in ("mean", "inner"))
+    if len(inner) < len(known):
+        return None
+    return hop_gain(data, state.baseline, axis=axis, given=np.stack(inner, axis=-1) if inner else None)
+
+
+def _course(variant: Variant, found: Courses, within: Hops | None, state: State) -> Variant:
     """The variant with the course of the first record, and its mean times [s]."""
+    if within is not None:
+        low, high = within.times
+        values = {"low": float(low), "high": float(high), "hops": within.hops}
+        return replace(variant, values=values, design=within.share.mean(axis=1)[None, None], inside=within.share)
     block = float(state.reduced.attrs["block_s"])
     low, high = found.times[0] * block
     values = {"low": float(low), "high": float(high), "hops": float(found.hops[0])}

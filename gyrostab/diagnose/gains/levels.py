@@ -17,12 +17,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.gains.products import WIDTHS, mean_products, pairs_of, take_out
+from gyrostab.diagnose.gains.products import WIDTHS, Products, mean_products, pairs_of, take_out
 from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.kernels.evidence import mixed_evidence
 from gyrostab.kernels.levels import level_tables, levels_smooth
 
-__all__ = ["Courses", "level_courses", "level_gains"]
+__all__ = ["HOPS", "Courses", "course_evidence", "level_courses", "level_gains", "usual_courses", "waves"]
 
 Array = NDArray[np.float64]
 #: Parts of a block, each on one level.
@@ -30,8 +30,9 @@ PARTS = 4
 #: Hops that it takes: one or two are jumps.
 HOPS = 5.0
 _SHORTEST, _FIRST = 0.5, 5.0  # blocks: the shortest mean time on a level, and the one that the search begins with
-_STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))  # quantiles of the means that may be levels
-_TRIAL, _ROUNDS, _STILL = 3, 14, 0.01
+#: Quantiles of the means that may be levels.
+STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
+_TRIAL, _ROUNDS, _MANY_ROUNDS, _STILL = 3, 14, 60, 0.01
 _DRIFTS = (0, 8)  # waves of a drift
 
 
@@ -51,6 +52,10 @@ class Courses:
         Expected number.
     cost : ndarray, shape (record,)
         Of saying the course [nats].
+    log : ndarray, shape (record,)
+        Logarithm of the likelihood of the means, white noise and all.
+    scale : ndarray, shape (record,)
+        Scatter over the white variance.
     """
 
     share: Array
@@ -59,9 +64,20 @@ class Courses:
     times: Array
     hops: Array
     cost: Array
+    log: Array
+    scale: Array
 
 
-def level_courses(values: Array, variance: Array, present: NDArray[np.bool_], beside: Array) -> Courses:
+def level_courses(
+    values: Array,
+    variance: Array,
+    present: NDArray[np.bool_],
+    beside: Array,
+    *,
+    starts: Sequence[tuple[float, float]] = STARTS,
+    least: float = 1.0,
+    parts: int = PARTS,
+) -> Courses:
     """Courses of biases of two levels in white noise, by expectation and maximisation from several starts.
 
     Parameters
@@ -74,6 +90,12 @@ def level_courses(values: Array, variance: Array, present: NDArray[np.bool_], be
         Blocks that are used.
     beside : ndarray, shape (block, column)
         Columns of free size, the first of them constant.
+    starts : sequence of (float, float)
+        Quantiles of the means that may be the levels.
+    least : float
+        Of the white variance, that the scatter may be.
+    parts : int
+        Of a block, at least.
 
     Examples
     --------
@@ -86,27 +108,33 @@ def level_courses(values: Array, variance: Array, present: NDArray[np.bool_], be
     y = np.where(present, values.T, 0.0)
     weight = np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0)
     plain = np.linalg.lstsq(beside * np.sqrt(weight)[:, None], (y * np.sqrt(weight)).T, rcond=None)[0].T
-    level = np.quantile((y - plain @ beside.T)[:, present], np.unique(_STARTS), axis=1)
+    level = np.quantile((y - plain @ beside.T)[:, present], np.unique(starts), axis=1)
     tried = []
-    for start in _STARTS:
-        first, last = (level[int(np.searchsorted(np.unique(_STARTS), one))] for one in start)
+    for start in starts:
+        first, last = (level[int(np.searchsorted(np.unique(starts), one))] for one in start)
         size = np.concatenate([plain, (last - first)[:, None]], axis=1)
         size[:, 0] += first
         fit = _Fit(size, np.full((len(y), 2), _FIRST), np.ones(len(y)))
-        tried.append(_improved(fit, y, weight, beside, _TRIAL))
+        tried.append(_improved(fit, y, weight, beside, _TRIAL, least))
     chosen = np.argmax([log for _, log in tried], axis=0)
-    best = _Fit(*(_picked([getattr(fit, item.name) for fit, _ in tried], chosen) for item in fields(_Fit)))
-    best, _ = _improved(best, y, weight, beside, _ROUNDS)
-    return _told(best, y, weight, beside)
+    size, times, scale = (_picked([getattr(fit, name) for fit, _ in tried], chosen) for name in ("size", "times", "scale"))
+    best = _Fit(size, times, scale)
+    best, _ = _improved(best, y, weight, beside, _ROUNDS, least)
+    told = _told(best, y, weight, beside)
+    if parts > PARTS:
+        finer, _ = _improved(_Fit(best.size, best.times, np.ones(len(y)), parts), y, weight, beside, _MANY_ROUNDS, least)
+        told = _told(finer, y, weight, beside)
+    return told
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Sizes of the columns and of the step (record, column), mean times (record, 2), and the scale of the noise (record,)."""
+    """Sizes of the columns and of the step (record, column), mean times (record, 2), the scale of the noise (record,); parts of a block."""
 
     size: Array
     times: Array
     scale: Array
+    parts: int = PARTS
 
 
 def _picked(several: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
@@ -118,10 +146,10 @@ def _smoothed(fit: _Fit, y: Array, weight: Array, beside: Array) -> tuple[Array,
     """Log likelihood, share and its square, steps up, and the sum of squares over the white variance."""
     left = y - fit.size[:, :-1] @ beside.T
     step = fit.size[:, -1]
-    levels = step[:, None, None] * np.arange(PARTS + 1) / PARTS
+    levels = step[:, None, None] * np.arange(fit.parts + 1) / fit.parts
     log = -0.5 * (weight / fit.scale[:, None])[..., None] * (left[..., None] - levels) ** 2
     most = log.max(axis=2)
-    chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], PARTS)
+    chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], fit.parts)
     start = fit.times / fit.times.sum(axis=1, keepdims=True)
     found, share, square, up = levels_smooth(np.exp(log - most[..., None]), chance, rises, start)
     seen = weight > 0.0
@@ -130,7 +158,7 @@ def _smoothed(fit: _Fit, y: Array, weight: Array, beside: Array) -> tuple[Array,
     return found, share, square, up, away @ weight
 
 
-def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int) -> tuple[_Fit, Array]:
+def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, least: float) -> tuple[_Fit, Array]:
     """Expectation and maximisation, until nothing moves; and the log likelihood."""
     n, count = y.shape[1], int((weight > 0.0).sum())
     still = _STILL / np.sqrt(np.median(weight[weight > 0.0]))
@@ -149,9 +177,10 @@ def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int) ->
         down = np.maximum(up + share[:, 0] - share[:, -1], 0.0)
         times = np.stack([(n - high + 0.5) / (up + 0.5), (high + 0.5) / (down + 0.5)], axis=1)
         moved = np.abs(size - fit.size).max()
-        fit = _Fit(size, np.clip(times, _SHORTEST, n), np.maximum(total / count, 1.0))
+        slow = rounds == _MANY_ROUNDS and np.abs(np.log(times / fit.times)).max() > _STILL
+        fit = _Fit(size, np.clip(times, _SHORTEST * PARTS / fit.parts, n), np.maximum(total / count, least), fit.parts)
         log, share, square, up, total = _smoothed(fit, y, weight, beside)
-        if moved < still:
+        if moved < still and not slow:
             break
     return fit, log
 
@@ -171,7 +200,47 @@ def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> Courses:
         times=np.where(turned[:, None], fit.times[:, ::-1], fit.times),
         hops=hops,
         cost=expected - log + _unknown(hops, y.shape[1]),
+        log=log,
+        scale=fit.scale,
     )
+
+
+def usual_courses(
+    found: Courses, variance: Array, present: NDArray[np.bool_], *, parts: int, count: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Logarithms of the likelihood (record,), and shares (record, block), that means of two levels have that hop as it was found.
+
+    Parameters
+    ----------
+    found : Courses
+        Of one record.
+    variance, present
+        As for `level_courses`.
+    parts : int
+        Of a block.
+    count : int
+        Records that are drawn.
+    """
+    n, (low, high) = present.size, found.times[0]
+    share = np.stack([_drawn_course(n, low, high, rng) for _ in range(count)])
+    noise = np.sqrt(variance * found.scale[0]) * rng.standard_normal(share.shape)
+    y = np.where(present, found.step[0] * share + noise, 0.0)
+    size = np.tile([0.0, found.step[0]], (count, 1))
+    fit = _Fit(size, np.tile(found.times[0], (count, 1)), np.full(count, found.scale[0]), parts)
+    return _smoothed(fit, y, np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0), np.ones((n, 1)))[:2]
+
+
+def _drawn_course(n: int, low: float, high: float, rng: np.random.Generator) -> Array:
+    """Share of n blocks on the upper level, for mean times on both levels [blocks]."""
+    first = int(rng.random() < high / (low + high))
+    pairs = 16 + int(2.0 * n / (low + high))
+    mean = np.array([low, high])[(np.arange(2 * pairs) + first) % 2]
+    at, up = [0.0], [0.0]
+    while at[-1] < n:
+        stay = rng.exponential(mean)
+        at += list(at[-1] + np.cumsum(stay))
+        up += list(up[-1] + np.cumsum(stay * ((np.arange(2 * pairs) + first) % 2)))
+    return np.diff(np.interp(np.arange(n + 1.0), at, up))
 
 
 def _unknown(hops: Array, blocks: int) -> Array:
@@ -216,8 +285,8 @@ def level_gains(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Arr
     log_weight = baseline["grid_prior"].sel(axis=axis).values
     safe = np.where(present[:, None], values, 0.0)
     tried = []
-    for waves in _DRIFTS:
-        found = level_courses(safe, variance, present, np.concatenate([_waves(n, waves), own], axis=1))
+    for count in _DRIFTS:
+        found = level_courses(safe, variance, present, np.concatenate([waves(n, count), own], axis=1))
         worth = _worth(found, safe, own, frame, grid, log_weight) - np.log(len(_DRIFTS))
         tried.append((np.where(found.hops >= HOPS, worth, -np.inf), found))
     chosen = np.argmax([gain for gain, _ in tried], axis=0)
@@ -225,7 +294,7 @@ def level_gains(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Arr
     return _picked([gain for gain, _ in tried], chosen), best
 
 
-def _waves(n: int, count: int) -> Array:
+def waves(n: int, count: int) -> Array:
     """A constant, and slow waves that stand for a drift while the course is sought."""
     return np.asarray(np.cos(np.pi * (np.arange(n)[:, None] + 0.5) / n * np.arange(count + 1)))
 
@@ -245,14 +314,30 @@ def _worth(found: Courses, values: Array, given: Array, frame: dict[str, Any], g
     weight = log_weight - np.logaddexp.reduce(log_weight)
     out = np.empty(records)
     for r in range(records):
-        base = (weight - 0.5 * (products.square[:, r] + products.log_determinant))[None]
-        unit = 1.0 / np.sqrt(max(usual[r] + scatter[r], 1e-300))
-        rotated = (products.cross[:, r, r] * unit)[None, None, :, None]
-        eigenvalues = ((products.gram[:, r, r] + scatter[r]) * unit**2)[None, :, None]
-        out[r] = _evidence(base, rotated, eigenvalues) - np.logaddexp.reduce(base[0])
+        none, two = course_evidence(products, r, scatter[r], weight, unit=usual[r])
+        out[r] = two - none
     return out - found.cost
 
 
-def _evidence(base: Array, rotated: Array, eigenvalues: Array) -> float:
-    """Of the step, whose prior has the widths of all factors."""
-    return float(mixed_evidence(base, np.ascontiguousarray(rotated), np.maximum(eigenvalues, 0.0), np.square(WIDTHS))[0, 0])
+def course_evidence(products: Products, place: int, scatter: float, log_weight: Array, *, unit: float) -> tuple[float, float]:
+    """Logarithms of the evidence of no course and of one, over a grid of the noise.
+
+    Parameters
+    ----------
+    products : Products
+        Of records and courses, in the same number.
+    place : int
+        Of the record and its course.
+    scatter : float
+        Of the course, over the white variance.
+    log_weight : ndarray, shape (grid,)
+        Of the grid points.
+    unit : float
+        Square of the course over the white variance; the prior of the step has the widths of all factors.
+    """
+    base = (log_weight - 0.5 * (products.square[:, place] + products.log_determinant))[None]
+    size = 1.0 / np.sqrt(max(unit + scatter, 1e-300))
+    rotated = np.ascontiguousarray((products.cross[:, place, place] * size)[None, None, :, None])
+    eigenvalues = np.maximum((products.gram[:, place, place] + scatter) * size**2, 0.0)[None, :, None]
+    two = float(mixed_evidence(base, rotated, eigenvalues, np.square(WIDTHS))[0, 0])
+    return float(np.logaddexp.reduce(base[0])), two

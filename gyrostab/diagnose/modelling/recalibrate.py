@@ -18,12 +18,12 @@ from gyrostab.diagnose.effects.cells import State, begin_state, effective, witne
 from gyrostab.diagnose.effects.explained import Part, explain_away, odd_blocks, take_part
 from gyrostab.diagnose.effects.response import is_filter, response_of
 from gyrostab.diagnose.effects.sizes import part_mixture
-from gyrostab.diagnose.modelling.refit import FORM_ERROR, Fitted
+from gyrostab.diagnose.modelling.refit import FORM_ERROR, Fitted, fit_claims
 from gyrostab.diagnose.naming.claims import Naming
 from gyrostab.physics.base import Effect
 from gyrostab.physics.phase import fold
 
-__all__ = ["recalibrate", "with_noise"]
+__all__ = ["recalibrate", "with_noise", "without_hops"]
 
 Array = NDArray[np.float64]
 _GROUPS = 150  # of blocks of like level, over which powers are averaged
@@ -116,6 +116,23 @@ _OF_AXIS = (
     "coefficient", "stderr", "spectrum", "mean_variance", "square", "square_stderr", "posterior", "posterior_slow",
     "grid_K", "grid_B", "grid_prior", "grid_calibrated",
 )  # fmt: skip
+
+
+def without_hops(naming: Naming, baseline: xr.Dataset) -> xr.Dataset:
+    """The noise beside biases that hop within blocks alone: with these for noise it is another one, to which nothing can be compared.
+
+    Parameters
+    ----------
+    naming : Naming
+    baseline : xarray.Dataset
+        That the naming started from; returned as it is unless it was calibrated on the recording, and such a bias is named.
+    """
+    hops = tuple(one for one in naming.claims if any(part.variant.inside.size for part in one.parts))
+    if not hops:
+        return baseline
+    alone = replace(naming, claims=hops, unknown=())
+    noise = recalibrate(alone, baseline, fit_claims(alone, baseline))
+    return noise if noise is baseline else noise.assign_attrs(recalibrated=[])
 
 
 def _kept(baseline: xr.Dataset, row: int) -> Posterior:

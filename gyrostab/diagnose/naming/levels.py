@@ -9,7 +9,7 @@ from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.naming.claims import Naming
 from gyrostab.diagnose.naming.parts import gain_of
 
-__all__ = ["followed_first", "renewed", "without_levels"]
+__all__ = ["followed_first", "hopping", "renewed", "without_levels"]
 
 _VIEW = "levels"
 
@@ -21,6 +21,11 @@ def followed_first(passing: list[str], parts: Mapping[str, Sequence[Part]]) -> l
     """
     follows = any(part.candidate.view == "mean" and any(part.candidate.driver) for key in passing for part in parts[key])
     return [key for key in passing if not follows or all(part.candidate.view != _VIEW for part in parts[key])]
+
+
+def hopping(passing: list[str], parts: Mapping[str, Sequence[Part]]) -> list[str]:
+    """Keys of biases that hop within blocks, unless a mean that follows a channel passes too."""
+    return [key for key in followed_first(passing, parts) if any(part.variant.inside.size for part in parts[key])]
 
 
 def renewed(parts: Sequence[Part], part: Part) -> Part:

@@ -23,7 +23,7 @@ from gyrostab.diagnose.naming.complete import flexible, redness, unrest
 from gyrostab.diagnose.naming.expected_claims import expected_claims
 from gyrostab.diagnose.naming.filters import without_slopes
 from gyrostab.diagnose.naming.layers import found_again, layers
-from gyrostab.diagnose.naming.levels import followed_first, renewed
+from gyrostab.diagnose.naming.levels import followed_first, hopping, renewed
 from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, lines_only, parts_of, tried_again, without_lines
 from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural, without_pulses
 from gyrostab.diagnose.naming.surrogates import beats_slides
@@ -226,7 +226,9 @@ class _Search:
         odd = [key for key in passing if parts[key][0].candidate.view == "marks" and not key.startswith("~")]
         shared = [key for key in passing if gain_sum(_witnessed(parts[key], state)) > need[key]]
         # odd samples first: they raise powers and means too, and not the other way round; then motion that another sensor sees as well
-        passing = odd or shared or without_slopes(self._without_locked_lines(passing, parts, state), parts, state, self.folds)
+        hops = hopping(passing, parts)  # what hops within blocks has a spectrum, tails and a level of the noise that changes
+        odd = [] if hops and passing.index(hops[0]) < min(map(passing.index, odd), default=0) else odd
+        passing = odd or shared or hops or without_slopes(self._without_locked_lines(passing, parts, state), parts, state, self.folds)
         passing = followed_first(passing, parts)
         if not passing:
             return None

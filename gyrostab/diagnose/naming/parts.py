@@ -41,9 +41,15 @@ def by_key(found: Sequence[Found]) -> dict[str, list[Part]]:
     for one in found:
         out.setdefault(one.candidate.key, []).extend(parts_of(one))
     for key, parts in out.items():
-        good = [part for part in parts if part.gain > LEAST]
+        good = _once([part for part in parts if part.gain > LEAST])
         out[key] = sorted(good or parts, key=lambda part: -part.gain)
     return out
+
+
+def _once(parts: Sequence[Part]) -> list[Part]:
+    """Parts without the spectrum of an effect on axes whose course within blocks is known: that holds the same powers."""
+    told = {part.row for part in parts if part.candidate.view == "levels" and part.variant.inside.size}
+    return [part for part in parts if part.candidate.view != "power" or part.row not in told]
 
 
 def without_lines(parts: dict[str, list[Part]]) -> dict[str, list[Part]]:

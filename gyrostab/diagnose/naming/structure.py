@@ -10,7 +10,8 @@ import numpy as np
 
 from gyrostab.diagnose.effects.candidates import LARGEST
 from gyrostab.diagnose.effects.cells import State
-from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.explained import Part, with_hops
+from gyrostab.diagnose.effects.search import hops_within
 from gyrostab.diagnose.gains.levels import level_gains
 from gyrostab.diagnose.naming.claims import Claim, Unknown
 from gyrostab.diagnose.naming.filters import on_all_axes
@@ -117,6 +118,9 @@ def _in_range(part: Part, state: State) -> bool:
 def _more_levels(part: Part, state: State) -> bool:
     """Whether, beside the two levels, the bias hops once more: then it has three or more."""
     axis = part.row[0]
+    if part.variant.inside.size:
+        within = hops_within(state.reduced, with_hops(state, part), axis)
+        return within is not None and within.gain > _MORE + _FORM * part.gain
     given = np.stack([*state.given.get(("mean", axis), []), part.variant.design[0, 0]], axis=-1)
     gain, _ = level_gains(state.reduced, state.baseline, axis=axis, given=given)
     return bool(gain[0] > _MORE + _FORM * part.gain)

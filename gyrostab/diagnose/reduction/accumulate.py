@@ -19,13 +19,15 @@ from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.timegrid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
-__all__ = ["FINE", "FOLLOWED", "HARMONICS", "PARTS", "PHASES", "Accumulator"]
+__all__ = ["FINE", "FOLLOWED", "HARMONICS", "PARTS", "PHASES", "PIECES", "Accumulator"]
 
 Array = NDArray[np.float64]
 #: Parts of the record with a line spectrum each; harmonics of the rotation; bins of the ramp's phase.
 PARTS, HARMONICS, PHASES = 8, (1, 2, 3), 40
 #: Parts of a block over which channels are averaged, and the beginnings of the names of those that effects follow with a lag.
 FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
+#: Pieces of a block over which the axes are averaged.
+PIECES = 16
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
 _GAP_S = 1.0  # shorter gaps are not listed
 _FOR_LATTICE = 64  # blocks whose values are kept
@@ -66,6 +68,7 @@ class Accumulator:
         self.line_sum = np.zeros((self.axes, PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, PARTS, 2))
+        self.pieces = np.zeros((2, self.axes, blocks, PIECES))  # sums and numbers of samples
         self.fine = {name: np.full((blocks, FINE), np.nan) for name in self.beside if name.startswith(FOLLOWED)}
         self.kept: list[Array] = []
         self.gaps: list[tuple[int, int]] = []
@@ -96,6 +99,10 @@ class Accumulator:
         self.together[:, part] = zeros_together(stretch.values[: self.axes])
         self.adjacent[:, part] = np.count_nonzero(present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1)
         self._find_gaps(part, present[: self.axes])
+        inner = np.arange(PIECES) * self.length // PIECES
+        for row in range(self.axes):
+            self.pieces[0, row, part] = np.add.reduceat(np.where(present[row], stretch.values[row], 0.0), inner, axis=1)
+            self.pieces[1, row, part] = np.add.reduceat(present[row], inner, axis=1, dtype=np.float64)
         for name, fine in self.fine.items():
             row, edges = self.axes + self.beside.index(name), np.arange(FINE) * self.length // FINE
             total = np.add.reduceat(np.where(present[row], stretch.values[row], 0.0), edges, axis=1)

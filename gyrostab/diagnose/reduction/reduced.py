@@ -111,9 +111,9 @@ def reduce_log(
         ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``,
         ``cross_shape`` (pair, block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
         ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
-        ``profile(axis, block, phase)``, ``lattice(axis)``, ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects
-        follow late, and the gaps and restarts in seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz]
-        of the bands.
+        ``profile(axis, block, phase)``, ``piece_mean`` and ``piece_samples`` (axis, block, inner), ``lattice(axis)``,
+        ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects follow late, and the gaps and restarts in seconds.
+        Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
     ------
@@ -192,8 +192,20 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
         "line_power": (("axis", "part", "line"), lines, _named("mean periodogram at full resolution, two-sided density", _POWER)),
         "line_weight": (("axis", "part"), weight, _named("blocks in each mean, as many as equal ones would do", "1")),
     }
-    variables |= _beside(work, log) | _locked(work) | _channels(work, log) | _fine(work, log) | _spans(work, log, restart)
+    variables |= _inner(work) | _beside(work, log) | _locked(work) | _channels(work, log) | _fine(work, log) | _spans(work, log, restart)
     return xr.Dataset(variables, coords=_coordinates(work, log), attrs=_attributes(work, log, present)).set_coords(["first", "second"])
+
+
+def _inner(work: Accumulator) -> dict[str, Any]:
+    """Means over pieces of the blocks, in which a bias that hops within blocks can be seen."""
+    total, count = work.pieces
+    dims = ("axis", "block", "inner")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = total / count
+    return {
+        "piece_mean": (dims, mean, _named("mean rate of a piece of the block", _RATE)),
+        "piece_samples": (dims, count.astype(np.int64), _named("samples of a piece of the block", "1")),
+    }
 
 
 def _named(name: str, units: str) -> dict[str, Any]:

@@ -1,0 +1,125 @@
+"""A bias that hops between two levels within blocks: its course in pieces of blocks, what is none, and what a diagnosis makes of it."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.signal import lfilter
+
+from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.gains.hops import Hops, hop_gain, hop_powers
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.log import make_log
+
+BLOCKS, PIECES, STEP, WHITE = 60, 16, 20.0, 0.01
+WALKS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0])
+
+
+def course_of(rng: np.random.Generator, low: float, high: float, seconds: float, rate: float) -> np.ndarray:
+    """Mean level of each sample, by the times of the hops alone."""
+    level, at, area = int(rng.integers(2)), [0.0], [0.0]
+    while at[-1] < seconds:
+        stay = rng.exponential((low, high)[level])
+        at.append(at[-1] + stay)
+        area.append(area[-1] + stay * level)
+        level = 1 - level
+    return np.diff(np.interp(np.arange(round(seconds * rate) + 1) / rate, at, area)) * rate
+
+
+def frame(pieces: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
+    """Means over pieces (block, piece) as a reduced record of one axis, and a baseline of white noise with any random walk."""
+    begin = np.arange(BLOCKS) * STEP
+    data = xr.Dataset(
+        {
+            "mean": (("axis", "block"), pieces.mean(axis=1)[None]),
+            "samples": (("axis", "block"), np.full((1, BLOCKS), PIECES * 10)),
+            "piece_mean": (("axis", "block", "inner"), pieces[None]),
+            "piece_samples": (("axis", "block", "inner"), np.full((1, BLOCKS, PIECES), 10)),
+            "begin": ("block", begin),
+            "end": ("block", begin + STEP),
+        },
+        {"axis": ["x"]},
+        {"block_s": STEP},
+    )
+    zero = np.zeros((1, WALKS.size))
+    grid = {"K": WALKS[None], "B": zero, "prior": zero, "calibrated": zero}
+    baseline = xr.Dataset(
+        {
+            "known_mean": (("axis", "block"), np.zeros((1, BLOCKS))),
+            "mean_variance": (("axis", "block"), np.full((1, BLOCKS), WHITE / PIECES)),
+            **{f"grid_{name}": (("axis", "grid"), one) for name, one in grid.items()},
+        },
+        {"axis": ["x"]},
+    )
+    return data, baseline
+
+
+def found_in(course: np.ndarray, rng: np.random.Generator) -> Hops:
+    noise = np.sqrt(WHITE) * rng.standard_normal((BLOCKS, PIECES))
+    found = hop_gain(*frame(course.reshape(BLOCKS, PIECES) + noise), axis="x")
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(("low", "high", "step"), [(4.0, 4.0, 2.0), (30.0, 3.0, 2.0), (8.0, 8.0, 0.5), (20.0, 3.0, 40.0)])
+def test_finds_hops_within_blocks_and_their_numbers(low: float, high: float, step: float) -> None:
+    rng = np.random.default_rng(1)
+    course = course_of(rng, low, high, BLOCKS * STEP, PIECES / STEP)
+    found = found_in(step * course, rng)
+    assert found.gain > 20.0
+    np.testing.assert_allclose(found.times, [low, high], rtol=0.4)
+    assert np.sqrt(np.mean((found.share.ravel() - course) ** 2)) < 0.15
+    slope = np.polyfit(found.share.ravel(), step * course, 1)[0]
+    assert slope == pytest.approx(step, rel=0.1)
+
+
+def test_noise_of_the_same_second_order_does_not_hop() -> None:
+    """Gauss-Markov noise of the variance and correlation time of the biases above, and noise that is louder than expected."""
+    rng = np.random.default_rng(2)
+    for time, size in [(2.0, 1.0), (2.0, 20.0), (10.0, 0.5), (10.0, 20.0), (0.01, 0.1), (0.01, 1.0)]:
+        keep = np.exp(-STEP / PIECES / time)
+        bias = size * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(BLOCKS * PIECES + 500))[500:]
+        assert found_in(bias, rng).gain < 3.0
+
+
+def test_waves_and_bumps_of_any_height_do_not_hop_between_two_levels() -> None:
+    rng = np.random.default_rng(3)
+    time = (np.arange(BLOCKS * PIECES) + 0.5) * STEP / PIECES
+    for period in (8.0, 20.0, 45.0):
+        for size in (0.5, 10.0):
+            assert found_in(size * np.sin(2.0 * np.pi * time / period), rng).gain < 3.0
+
+
+def test_three_levels_are_not_two() -> None:
+    rng = np.random.default_rng(4)
+    for dwell in (4.0, 20.0):
+        first, second = (course_of(rng, dwell, dwell, BLOCKS * STEP, PIECES / STEP) for _ in range(2))
+        assert found_in(2.0 * (first + second), rng).gain == -np.inf
+
+
+def test_powers_within_blocks_are_those_of_the_samples() -> None:
+    rng = np.random.default_rng(5)
+    course = course_of(rng, 15.0, 6.0, 1200.0, 10.0)
+    log = make_log(course[None], rate=10.0, unit="deg/h")
+    reduced = reduce_log(log, block="20s")
+    size = int(reduced.attrs["block_samples"])
+    seen = reduced["power"].values[0]
+    told = hop_powers(reduced["piece_mean"].values[0], 15.0, 6.0, size, 10.0)
+    slow = reduced["frequency"].values < 0.3
+    np.testing.assert_allclose(told[:, slow].mean(axis=0), seen[:, slow].mean(axis=0), rtol=0.05)
+    np.testing.assert_allclose(told.mean(axis=0), seen.mean(axis=0), rtol=0.25)  # the number of hops is one of chance
+    assert np.corrcoef(np.log(told[:, 1] + 1e-3), np.log(seen[:, 1] + 1e-3))[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(("low", "high", "deviations"), [(30.0, 3.0, 12.0), (4.0, 4.0, 3.0)])
+def test_a_diagnosis_names_it_with_its_numbers(low: float, high: float, deviations: float) -> None:
+    rng = np.random.default_rng(6)
+    course = course_of(rng, low, high, 1800.0, 5.0)
+    log = make_log((0.5 * rng.standard_normal(course.size) + 0.5 * deviations * course)[None], rate=5.0, unit="deg/h")
+    found = diagnose(log, nulls=100, seed=1)
+    assert [one["name"] for one in found.effects] == ["telegraph"]
+    assert found.verdict in ("explained", "partly explained")
+    numbers = found.effects[0]["parameters"]
+    assert numbers["step"]["value"] == pytest.approx(0.5 * deviations, rel=0.1)
+    for name, true in (("low", low), ("high", high)):
+        assert abs(numbers[name]["value"] - true) < 3.0 * numbers[name]["stderr"]
+    assert found.effects[0]["alternatives"] == []
