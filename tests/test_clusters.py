@@ -79,6 +79,24 @@ def test_cells_equal_the_sum_over_their_terms(seed, data):
                 assert float(cell[name]) == pytest.approx(want[name], rel=1e-6 if name == "avar" else 1e-10, abs=1e-12), name
 
 
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_few_pairs_of_clusters_find_their_samples_as_many_do(share):
+    """Few pairs take the places of the samples from the mask, many from an integral: the same bits, and those of the terms."""
+    rng, window = np.random.default_rng(8), 6000
+    x = rng.standard_normal(window + 900)
+    x[rng.random(x.size) < share] = np.nan
+    x[2000:2777] = np.nan
+    few, many = (surface(x, [*ks, 800, 1500, 2000], window=window, step=300).isel(axis=0) for ks in ([], [1, 2, 3]))
+    for name in ("avar", "count", "coverage", "white_response", "quantization_response", "ramp_response"):
+        assert np.array_equal(few[name], many[name].sel(tau=few.tau), equal_nan=True), name
+    for k in (800, 1500, 2000):
+        stride = int(cluster_strides(window, np.array([k]), np.array([0]))[0])
+        assert stride > 3  # so that all pairs together are fewer than the samples
+        want = cluster_cell(x[300 : 300 + window], k, stride=stride, first=300)
+        for name in ("avar", "white_response", "ramp_response", "coverage"):
+            assert float(few[name].isel(time=1).sel(tau=k)) == pytest.approx(want[name], rel=1e-9), name
+
+
 def test_a_short_window_uses_every_pair_and_a_long_one_as_many_as_have_something_to_add():
     ks = np.array([1, 31, 32, 100, 372, 499])
     assert list(cluster_strides(1000, ks, np.zeros(6, np.int64))) == [1, 1, 2, 2, 1, 1]

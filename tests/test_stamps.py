@@ -123,6 +123,23 @@ def test_last_stamp_after_200_hours_at_300_hertz():
     assert state[kernel.OPEN_RUN].tolist() == [last - 1000, 1000, 1001]
 
 
+def test_samples_between_stamps_are_counted_as_a_division_rounds_them():
+    rng = np.random.default_rng(4)
+    steps = rng.choice([0, 3, 4, 5, 6, 8, 10, 12, 14, 15, 16, 20, 25, 35, -5, -15, 400, -400], 3000)
+    stamps = np.cumsum(steps)
+    for gain in (0.0, 0.1, 0.5):  # without gain the phase stays on whole numbers, and many a stamp lies just between two samples
+        count, piece, phase = [0], [0], 0.0
+        for step in np.diff(stamps).tolist():
+            new = abs(step) > 300
+            k = 0 if new else round((step + phase) / 10.0)  # half to even
+            count.append(0 if new else count[-1] + k)
+            piece.append(piece[-1] + new)
+            phase = 0.0 if new else (1.0 - gain) * (step + phase - k * 10.0)
+        found = kernel.track(stamps, 10.0, gain, 300.0)
+        assert found[0].tolist() == count
+        assert found[1].tolist() == piece
+
+
 def test_count_along_a_lattice_survives_jitter_and_a_wrong_period():
     random = np.random.default_rng(1)
     samples = np.flatnonzero(random.random(20_000) > 0.1)

@@ -28,6 +28,8 @@ _TERMS = 384
 _SECTION = 8
 # Places of the sections: spread evenly, but in step with no regular loss.
 _GOLDEN = 0.6180339887498949
+# Bits of a word whose place has the bit 1, 2, 4, 8, 16 or 32.
+_BITS = np.array([sum(1 << place for place in range(64) if place >> i & 1) for i in range(6)], dtype=np.uint64).view(np.int64)
 
 
 def cluster_strides(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -46,15 +48,32 @@ def _ones(typing_context, word):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
+def _places(word):  # type: ignore[no-untyped-def]
+    """Sum of the places (0 to 63) of the bits of a word that are set."""
+    total = np.int64(0)
+    for i in range(_BITS.size):
+        total += _ones(word & _BITS[i]) << i
+    return total
+
+
+@njit(**INNER)
+def _places_before(mask, row, low):  # type: ignore[no-untyped-def]
+    """Sum of the numbers of the samples that are present before a sample: those in the rows before its own, and in its row below `low`."""
+    word = mask[row, 0] & low
+    return mask[row, 4] + (np.int64(row) << 6) * _ones(word) + _places(word)
+
+
+@njit(**INNER)
 def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
     """Which of n samples are present, from the runs of them, 64 to a row.
 
     Returns
     -------
-    int64 (n // 64 + 1, 4)
-        Samples present, and those of them that begin a run, as bits; numbers of both before these 64.
+    int64 (n // 64 + 1, 5)
+        Samples present, and those of them that begin a run, as bits; how many there are of both before these 64; sum of the numbers
+        (0 to n - 1) of the samples present before these 64.
     """
-    mask = np.zeros((n // 64 + 1, 4), np.int64)
+    mask = np.zeros((n // 64 + 1, 5), np.int64)
     one = np.int64(1)
     for r in range(starts.size):
         first, last = starts[r] >> 6, (stops[r] - 1) >> 6
@@ -69,6 +88,7 @@ def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
     for row in range(1, mask.shape[0]):
         mask[row, 2] = mask[row - 1, 2] + _ones(mask[row - 1, 0])
         mask[row, 3] = mask[row - 1, 3] + _ones(mask[row - 1, 1])
+        mask[row, 4] = _places_before(mask, row - 1, np.int64(-1))
     return mask
 
 
@@ -111,7 +131,12 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
         f1, f2 = float(n1), float(n2)
         at0, at1, at2 = np.uint64(m), np.uint64(m + k), np.uint64(m + 2 * k)
         d = (theta[at2] - theta[at1]) * f1 - (theta[at1] - theta[at0]) * f2  # n1 n2 times the difference of the means
-        apart = (places[at2] - places[at1]) * f1 - (places[at1] - places[at0]) * f2  # and that of their centres
+        if places.size:
+            before, behind = places[at1] - places[at0], places[at2] - places[at1]
+        else:
+            place1 = _places_before(mask, row1, low1)
+            before, behind = float(place1 - _places_before(mask, row0, low0)), float(_places_before(mask, row2, low2) - place1)
+        apart = behind * f1 - before * f2  # and that of their centres
         # a run that a cluster cuts counts in both
         runs = mask[row1, 3] + _ones(mask[row1, 1] & low1)
         cut0, cut1 = mask[row0, 0] & ~mask[row0, 1] & (low0 + one) != 0, mask[row1, 0] & ~mask[row1, 1] & (low1 + one) != 0
@@ -140,8 +165,8 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
     ----------
     theta : float64 (n + 1,)
         Integral of the rate over present samples, gaps adding nothing.
-    places : float64 (n + 1,)
-        As from `integrate_places`.
+    places : float64 (n + 1,) or (0,)
+        As from `integrate_places`, which pays where there are more pairs than samples; without it the same numbers come from the mask.
     mask
         As from `pack_mask`.
     window, step, k, stride : int

@@ -49,6 +49,7 @@ OPEN_RUN = slice(_RUN_GRID, _RUN_LENGTH + 1)
 _RING = 1 << 14
 _GAIN = 0.05  # of the phase: it follows the clock's course and not the jitter of single stamps
 _UNIT = 1e-9  # samples, of the phase in the state
+_NEAR = 1e-9  # samples, to the middle between two, where only the division tells which is nearer
 
 
 def new_state() -> tuple[np.ndarray, np.ndarray]:
@@ -84,6 +85,7 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
     count = np.zeros(n, dtype=np.int64)
     piece = np.zeros(n, dtype=np.int64)
     phase = 0.0  # of the latest sample, behind its stamp [ns]
+    least, most = (0.5 + _NEAR) * period, (1.5 - _NEAR) * period
     for i in range(1, n):
         step = float(stamps[i] - stamps[i - 1])
         piece[i] = piece[i - 1]
@@ -91,10 +93,14 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
             piece[i] += 1
             phase = 0.0
             continue
-        ahead = (step + phase) / period
-        k = int(np.rint(ahead))
+        moved = step + phase
+        if least < moved < most:  # one sample, as nearly always: told without a division that the next stamp would wait for
+            count[i] = count[i - 1] + 1
+            phase = (1.0 - gain) * (moved - period)
+            continue
+        k = int(np.rint(moved / period))
         count[i] = count[i - 1] + k
-        phase = (1.0 - gain) * (step + phase - k * period)
+        phase = (1.0 - gain) * (moved - k * period)
     return count, piece
 
 

@@ -103,7 +103,10 @@ def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, ce
 def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells):  # type: ignore[no-untyped-def]
     """Weighted clusters where too few terms are left (rate logs only)."""
     mask = pack_mask(starts, stops, theta.size - 1)
-    places = integrate_places(starts, stops, theta.size - 1)
+    pairs = 0.0  # to a sample
+    for i in range(ks.size):
+        pairs += poor[:, i].any() / strides[i]
+    places = integrate_places(starts, stops, theta.size - 1) if pairs > 1.0 else np.empty(0)
     for i in range(ks.size):
         if not poor[:, i].any():
             continue

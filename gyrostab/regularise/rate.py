@@ -85,11 +85,17 @@ def _in_one(held: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[ND
     return rows, values
 
 
+def _readable(block: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The stamps that could be read; all of them, as nearly always, are not copied."""
+    known = block != NO_STAMP
+    return block if known.all() else block[known]
+
+
 def _pools(stamps: Stamps, *, size: int = 8192, most: int = 64) -> list[NDArray[np.int64]]:
     """Stretches of stamps from all over the log, a few hundred thousand in all."""
     found: list[NDArray[np.int64]] = []
     for _, block in stamps():
-        block = block[block != NO_STAMP]
+        block = _readable(block)
         found += [block[i : i + size] for i in range(0, len(block), size)]
         if len(found) > 2 * most:
             found = found[::2]
@@ -201,12 +207,12 @@ def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest:
     table = np.empty((0, 6))
     zero: int | None = None
     for _, block in stamps():
-        known = np.flatnonzero(block != NO_STAMP)
-        block = block[known]
+        rows, block = block, _readable(block)
         if len(block) == 0:
             continue
         zero = int(block[0]) if zero is None else zero
         if counted:
+            known = np.flatnonzero(rows != NO_STAMP)
             piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
             count = known  # a row counts, with or without a stamp
         else:
