@@ -1,0 +1,33 @@
+"""The first run on a machine compiles the kernels, later ones load them from disk: the numbers are the same, bit for bit."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+FIT = """
+import hashlib
+import numpy as np
+from gyrostab.kernels.least_squares import fit_windows
+
+n, windows, rng = 24, 60, np.random.default_rng(1)
+tau = np.geomspace(1.0, 1e3, n)
+columns = np.stack([tau**power for power in (-2.0, -1.0, 0.0, 1.0, 2.0)], axis=1)
+truth = columns @ np.array([1.0, 0.3, 0.01, 1e-4, 1e-8])
+whole, near = np.ones((windows, n)), 0.6 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / 20.0
+pairs, ramps = np.tile(near, (4, 4, 1, 1)), np.tile(near / 2.0, (4, 1, 1))
+avar = rng.gamma(8.0, truth / 8.0, (windows, n))
+found = fit_windows(avar, whole, whole, whole, whole, columns, np.ones(5), pairs, ramps, np.full(n, 20.0), 31)
+assert np.isfinite(found[0]).any()
+print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())
+"""
+
+
+def test_the_process_that_compiles_fits_to_the_same_bits_as_those_that_load(tmp_path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run([sys.executable, "-c", FIT], env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
+    )
+    assert any(tmp_path.rglob("*.nbi"))
+    assert first == second
