@@ -30,10 +30,8 @@ __all__ = ["Found", "Tallies", "gains", "hops_within", "together", "totals"]
 
 Array = NDArray[np.float64]
 _PRICE = 1.5  # nats that another axis or view must bring
-_WITHIN, _LONG = (
-    2.0,
-    3.0,
-)  # blocks that a bias stays on a level at most, where pieces of blocks know it better; and where they can refute it
+_WITHIN = 2.0  # blocks that a bias stays on a level at most, where pieces of blocks know it better
+_LONG = 3.0  # the same, where they can refute it
 _STEP = 16.0  # standard deviations of a block's mean, above which four parts of a block are too few for its course
 _MOST_BLOCKS = 20_000  # of null records that come together, in which two levels are sought on an axis
 
