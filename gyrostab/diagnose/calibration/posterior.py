@@ -122,6 +122,7 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
     square[1] = max(float((fit.weight * fit.rest() / fit.columns[:, 1]).sum() / fit.weight.sum()), 0.0)
     spectrum = np.asarray(fit.columns @ square if fit.start is None else fit.start, dtype=np.float64)
     beside, precision = fit.free()
+    alone = not beside.shape[1] and fit.known is None and fit.start is None  # else the likelihood is not that of these powers only
     for _ in range(50):
         weight = fit.weight / spectrum**2
         normal, right, to_noise, to_right = _without(beside, precision, fit.columns, fit.rest(), weight)
@@ -133,7 +134,7 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
             after = np.asarray(np.maximum(after, _LEAST * spectrum))
         if not (after > 0.0).all():
             break
-        part = _step(fit, spectrum, after)
+        part = _step(fit, spectrum, after) if alone else 1.0
         square = square + part * (np.maximum(found, 0.0) - square)
         after = spectrum + part * (after - spectrum)
         change = np.abs(after / spectrum - 1.0).max()
