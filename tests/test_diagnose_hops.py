@@ -96,6 +96,19 @@ def test_three_levels_are_not_two() -> None:
         assert found_in(2.0 * (first + second), rng).gain == -np.inf
 
 
+@pytest.mark.parametrize("dwell", [2.0, 4.0, 10.0])
+def test_a_bias_that_hops_among_three_levels_at_random_is_not_two(dwell: float) -> None:
+    """Two levels follow it too, hopping fast; but pieces in a row are then as long on the upper one."""
+    rng, fine = np.random.default_rng(1), 20
+    course = np.empty(BLOCKS * PIECES * fine)
+    at, level = 0, 1
+    while at < course.size:
+        stay = max(1, int(rng.exponential(dwell) * PIECES / STEP * fine))
+        course[at : at + stay] = level
+        at, level = at + stay, (level + int(rng.integers(1, 3))) % 3
+    assert found_in(4.0 * course.reshape(-1, fine).mean(axis=1), rng).gain == -np.inf
+
+
 def test_powers_within_blocks_are_those_of_the_samples() -> None:
     rng = np.random.default_rng(5)
     course = course_of(rng, 15.0, 6.0, 1200.0, 10.0)
