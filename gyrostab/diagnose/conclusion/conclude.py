@@ -36,7 +36,7 @@ from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.modelling.refit import Fitted, fit_claims
 from gyrostab.diagnose.naming.claims import Claim
-from gyrostab.diagnose.naming.levels import without_levels
+from gyrostab.diagnose.naming.hopping import without_levels
 from gyrostab.diagnose.naming.name import Naming
 from gyrostab.diagnose.naming.waves import without_waves
 from gyrostab.diagnose.task import Compared, Task, still_lines

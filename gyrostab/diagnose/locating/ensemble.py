@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from gyrostab.diagnose.calibration.noise_statistics import line_columns, white_variance
 from gyrostab.diagnose.gains.wander import known_wander
-from gyrostab.diagnose.locating.shared import Shared, shared_by, shared_spectra, shared_white
+from gyrostab.diagnose.locating.shared_noise import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.outliers import CHANCE, beyond_chance
 from gyrostab.kernels.periodogram import band_covariance, taper
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times, ornstein_uhlenbeck_means
