@@ -12,6 +12,7 @@ from gyrostab.diagnose.effects.candidates import Variant
 from gyrostab.diagnose.effects.cells import State
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
+from gyrostab.diagnose.modelling.between import Point, refined
 from gyrostab.diagnose.naming.claims import Naming
 from gyrostab.diagnose.naming.name import AMBIGUOUS, FORM
 from gyrostab.physics.registry import effects
@@ -44,40 +45,38 @@ def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, 
     nuisance : dict of str to (float, float)
         Value and standard deviation of the others; NaN for one that is told, but not measured.
     """
-    family = _family(part, naming)
-    several = [part_mixture(part, state, variant) for variant in family]
-    usual = _usual(part, family, _evidence(several))
-    family, several = [family[place] for place in usual], [several[place] for place in usual]
-    evidence = np.array(_evidence(several))
-    whole = _merged(several)
-    mean, covariance = whole.moments()
+    grid = [Point(variant, part_mixture(part, state, variant)) for variant in _family(part, naming)]
+    usual = _usual(part, [point.variant for point in grid], [point.evidence for point in grid])
+    points = refined(part, state, [grid[place] for place in usual])
+    family = [point.variant for point in points]
+    evidence = np.array([point.evidence for point in points])
+    mean, covariance = _merged(points).moments()
     at_once = _at_once(family)
     told = [place for place in at_once if evidence[place] > evidence.max() - AMBIGUOUS - FORM * max(part.gain, 0.0)]
     if told:
-        middle, _ = _merged([several[place] for place in told]).moments()
+        middle, _ = _merged([points[place] for place in told]).moments()
         mean, covariance = middle, covariance + np.outer(middle - mean, middle - mean)
-    share = np.exp(evidence - np.logaddexp.reduce(evidence))
+    weighed = evidence + np.log([point.share for point in points])
+    share = np.exp(weighed - np.logaddexp.reduce(weighed))
     nuisance = {}
     for name in {key for one in family for key, value in one.values.items() if not isinstance(value, str)}:
-        grid = np.array([float(one.values[name]) for one in family])
-        if not np.isfinite(grid).all():
+        tried = np.array([float(one.values[name]) for one in family])
+        if not np.isfinite(tried).all():
             continue
-        if np.ptp(grid) == 0.0:
-            nuisance[name] = (float(grid[0]), math.nan)
+        if np.ptp(tried) == 0.0:
+            nuisance[name] = (float(tried[0]), math.nan)
             continue
         none = bool(told) and _is_lag(name)
-        middle_of = 0.0 if none else float(share @ grid)
-        spread = math.sqrt(float(share @ (grid - middle_of) ** 2))
-        nuisance[name] = (middle_of, max(spread, 0.3 * _spacing(grid, middle_of)))
+        middle_of = 0.0 if none else float(share @ tried)
+        spread = math.sqrt(float(share @ (tried - middle_of) ** 2))
+        nuisance[name] = (middle_of, max(spread, 0.3 * _spacing(tried, middle_of)))
     return mean, covariance, nuisance
 
 
-def _merged(several: Sequence[Mixture]) -> Mixture:
-    return Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
-
-
-def _evidence(several: Sequence[Mixture]) -> list[float]:
-    return [float(np.logaddexp.reduce(one.log_weight)) for one in several]
+def _merged(points: Sequence[Point]) -> Mixture:
+    log_weight = np.concatenate([point.sizes.log_weight + math.log(point.share) for point in points])
+    mean, covariance = (np.concatenate([getattr(point.sizes, name) for point in points]) for name in ("mean", "covariance"))
+    return Mixture(log_weight, mean, covariance)
 
 
 def _family(part: Part, naming: Naming) -> list[Variant]:
