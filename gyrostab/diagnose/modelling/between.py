@@ -1,4 +1,4 @@
-"""Values of a lag, a time or a play between those of the grid, where the record tells them better than the grid is fine."""
+"""Lags, times and plays between the values of the grid and beyond its ends, where the record tells them better than the grid does."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from gyrostab.diagnose.effects.candidates import Variant, variants_of
 from gyrostab.diagnose.effects.cells import State
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
+from gyrostab.errors import OptionError
 from gyrostab.physics.registry import effects
 
 __all__ = ["Point", "refined"]
 
-_SCALES, _INSTANT = ("s", "h", "degC"), "at"  # units of what has values between two others; but not an instant, whose grid is fine
+_SECONDS = {"s": 1.0, "h": 3600.0}
+_SCALES, _INSTANT = (*_SECONDS, "degC"), "at"  # units of what has values between two others; but not an instant, whose grid is fine
 _LIKELY, _STEEP, _MOVED = 6.0, 1.0, 0.5  # nats below the best; nats and standard errors from one value to the next
-_ROUNDS, _MOST = 5, 40  # halvings of a step of the grid; points that are added at most
+_ROUNDS, _MOST = 5, 40  # halvings of a step of the grid, and steps beyond it; points that are added between them at most
+_NONE = 100.0  # times smaller than the next value is as good as none
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,8 @@ class Point:
 def refined(part: Part, state: State, points: Sequence[Point]) -> list[Point]:
     """Points with others between them, wherever the likelihood or the size of an effect on means changes much from one to the next.
 
-    A step of the grid is halved about the best point, and again while its ends are likely and differ, so that the likelihood is smooth from
-    point to point. What a step stands for is shared by the points in it.
+    The grid goes on where the likelihood still rises at its end. A step is halved about the best point, and again while its ends are likely
+    and differ, so that the likelihood is smooth from point to point. What a step stands for is shared by the points in it.
 
     Parameters
     ----------
@@ -54,6 +57,9 @@ def refined(part: Part, state: State, points: Sequence[Point]) -> list[Point]:
     if name is None:
         return list(points)
     found = [_Placed(point, *place) for point, place in zip(points, _places(points, name), strict=True)]
+    for line in sorted({one.line for one in found}):
+        for down in (True, False):
+            found += _beyond(part, state, name, sorted((one for one in found if one.line == line), key=lambda one: one.place), found, down)
     for _ in range(_ROUNDS):
         steps = _wide(found)[: _MOST - len(found) + len(points)]
         new = [made for one, other in steps if (made := _middle(part, state, name, one, other)) is not None]
@@ -76,12 +82,15 @@ def _scale(part: Part, points: Sequence[Point]) -> str | None:
     """The first parameter of the grid that is a scale and has several values."""
     if part.candidate.view != "mean":
         return None
-    units = {item.name: item.unit for item in effects()[part.candidate.effect].parameters()}
     for name in points[0].variant.values:
         values = {point.variant.values.get(name) for point in points}
-        if len(values) > 2 and units.get(name) in _SCALES and name != _INSTANT:
+        if len(values) > 2 and _unit(part, name) in _SCALES and name != _INSTANT:
             return name
     return None
+
+
+def _unit(part: Part, name: str) -> str:
+    return next((item.unit for item in effects()[part.candidate.effect].parameters() if item.name == name), "")
 
 
 def _places(points: Sequence[Point], name: str) -> list[tuple[int, float]]:
@@ -127,12 +136,39 @@ def _differ(one: Point, other: Point) -> bool:
 def _middle(part: Part, state: State, name: str, one: _Placed, other: _Placed) -> _Placed | None:
     """The point in the middle of a step: of the logarithm, but from none on."""
     low, high = sorted((_value(one.point, name), _value(other.point, name)))
-    value = math.sqrt(low * high) if low > high / 100.0 else 0.5 * (low + high)
-    wanted = replace(one.point.variant, values={**one.point.variant.values, name: value})
-    variant = variants_of(part.candidate, wanted, state.reduced, state.baseline["coefficient"])
+    value = math.sqrt(low * high) if low > high / _NONE else 0.5 * (low + high)
+    return _made(part, state, name, one, value, 0.5 * (one.place + other.place))
+
+
+def _beyond(part: Part, state: State, name: str, line: Sequence[_Placed], found: Sequence[_Placed], down: bool) -> list[_Placed]:
+    """Points beyond an end of a line, by steps like the last one, as long as the likelihood rises and is the largest but for `_LIKELY`.
+
+    A lag longer than the record is only another slope.
+    """
+    before, last = (line[1], line[0]) if down else (line[-2], line[-1])
+    ratio = _value(last.point, name) / max(_value(before.point, name), 1e-300)
+    top, out = max(one.point.evidence for one in found) - _LIKELY, list[_Placed]()
+    longest = float(state.reduced["end"].values[-1]) / _SECONDS.get(_unit(part, name), math.nan)
+    while len(out) < _ROUNDS and 1.0 / _NONE < ratio < _NONE and last.point.evidence > max(before.point.evidence + _STEEP, top):
+        value = ratio * _value(last.point, name)
+        after = None if value > longest else _made(part, state, name, last, value, last.place + (-1.0 if down else 1.0))
+        if after is None:
+            break
+        out.append(after)
+        before, last = last, after
+    return out
+
+
+def _made(part: Part, state: State, name: str, like: _Placed, value: float, place: float) -> _Placed | None:
+    """A point of another value on the same line; None where the effect cannot have it."""
+    wanted = replace(like.point.variant, values={**like.point.variant.values, name: value})
+    try:
+        variant = variants_of(part.candidate, wanted, state.reduced, state.baseline["coefficient"])
+    except OptionError:
+        return None
     if variant is None or variant.values.get(name) != value:
         return None
-    return _Placed(Point(variant, part_mixture(part, state, variant)), one.line, 0.5 * (one.place + other.place))
+    return _Placed(Point(variant, part_mixture(part, state, variant)), like.line, place)
 
 
 def _shared(found: Sequence[_Placed]) -> list[Point]:
