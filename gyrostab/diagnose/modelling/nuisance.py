@@ -21,9 +21,10 @@ __all__ = ["sizes_over"]
 
 Array = NDArray[np.float64]
 _AT_ONCE = 1e-2  # s: a lag that is as good as none
+_TAILS = (0.025, 0.975)
 
 
-def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, dict[str, tuple[float, float]]]:
+def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
     """Sizes of a part, averaged over the noise and over what else is free.
 
     An exponent has its default and a lag is none, unless other values are better by 3 nats and an error of the form. The scatter of the
@@ -42,8 +43,9 @@ def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, 
     mean : ndarray, shape (column,)
     covariance : ndarray, shape (column, column)
         About that mean.
-    nuisance : dict of str to (float, float)
-        Value and standard deviation of the others; NaN for one that is told, but not measured.
+    nuisance : dict of str to (float, float) or (float, float, float, float)
+        Value and standard deviation of the others, and the ends of the 95 % interval where that is not symmetric; NaN for one that is told,
+        but not measured.
     """
     grid = [Point(variant, part_mixture(part, state, variant)) for variant in _family(part, naming)]
     usual = _usual(part, [point.variant for point in grid], [point.evidence for point in grid])
@@ -58,7 +60,7 @@ def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, 
         mean, covariance = middle, covariance + np.outer(middle - mean, middle - mean)
     weighed = evidence + np.log([point.share for point in points])
     share = np.exp(weighed - np.logaddexp.reduce(weighed))
-    nuisance = {}
+    nuisance: dict[str, tuple[float, ...]] = {}
     for name in {key for one in family for key, value in one.values.items() if not isinstance(value, str)}:
         tried = np.array([float(one.values[name]) for one in family])
         if not np.isfinite(tried).all():
@@ -68,8 +70,8 @@ def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, 
             continue
         none = bool(told) and _is_lag(name)
         middle_of = 0.0 if none else float(share @ tried)
-        spread = math.sqrt(float(share @ (tried - middle_of) ** 2))
-        nuisance[name] = (middle_of, max(spread, 0.3 * _spacing(tried, middle_of)))
+        spread = max(math.sqrt(float(share @ (tried - middle_of) ** 2)), 0.3 * _spacing(tried, middle_of))
+        nuisance[name] = (middle_of, spread) if none else (middle_of, spread, *_ends(tried, share, middle_of))
     return mean, covariance, nuisance
 
 
@@ -108,6 +110,20 @@ def _lags(values: Mapping[str, float | str]) -> dict[str, float]:
 
 def _is_lag(name: str) -> bool:
     return name == "lag" or name.endswith("_lag")
+
+
+def _ends(tried: Array, share: Array, middle: float) -> tuple[float, float]:
+    """Ends of the 95 % interval: every value stands for all that are nearer to it than to the next, and for as much beyond the last.
+
+    Lags, times and plays are known to a factor, so that there is more room above than below.
+    """
+    known, place = np.unique(tried, return_inverse=True)
+    between = np.where(known[:-1] > known[1:] / 100.0, np.sqrt(known[:-1] * known[1:]), 0.5 * (known[:-1] + known[1:]))
+    first, last = known[0] - (between[0] - known[0]), known[-1] + (known[-1] - between[-1])
+    edge = np.concatenate([[max(first, 0.0)], between, [last]])
+    below = np.append(0.0, np.cumsum(np.bincount(place, weights=share)))
+    low, high = np.interp(_TAILS, below / below[-1], edge)
+    return min(float(low), middle), max(float(high), middle)
 
 
 def _spacing(grid: Array, place: float) -> float:
