@@ -17,26 +17,39 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.registry import effects
 
 __all__ = ["Point", "refined"]
-
 _SECONDS = {"s": 1.0, "h": 3600.0}
 _SCALES, _INSTANT = (*_SECONDS, "degC"), "at"  # units of what has values between two others; but not an instant, whose grid is fine
-_LIKELY, _STEEP, _MOVED = 6.0, 1.0, 0.5  # nats below the best; nats and standard errors from one value to the next
+_LIKELY, _STEEP, _MOVED = 6.0, 1.0, 1.0  # nats below the best; nats and standard errors from one value to the next
 _ROUNDS, _MOST = 5, 40  # halvings of a step of the grid, and steps beyond it; points that are added between them at most
 _NONE = 100.0  # times smaller than the next value is as good as none
 
 
 @dataclass(frozen=True)
 class Point:
-    """A variant, the sizes that it has, and the share of a step of the grid that it stands for."""
+    """A variant, its sizes, the share of a step of the grid that it stands for, and by how much it is `unlikely` beforehand [nats]."""
 
     variant: Variant
     sizes: Mixture
     share: float = 1.0
+    unlikely: float = 0.0
 
     @property
     def evidence(self) -> float:
         """Logarithm of its likelihood, but for a constant."""
-        return float(np.logaddexp.reduce(self.sizes.log_weight))
+        return float(np.logaddexp.reduce(self.sizes.log_weight)) - self.unlikely
+
+    def weighed(self) -> Mixture:
+        """The sizes, weighted by all of this."""
+        return replace(self.sizes, log_weight=self.sizes.log_weight - self.unlikely + math.log(self.share))
+
+
+def _scaled(variant: Variant, sizes: Mixture) -> Point:
+    """A point whose sizes are as likely beforehand as those of others of as many standard errors.
+
+    One number is another effect where a time is longer: were all numbers alike, slow forms would be, which look like their beginning only.
+    """
+    mean = np.einsum("g,gij->ij", sizes.weights(), sizes.covariance)
+    return Point(variant, sizes, unlikely=0.5 * float(np.linalg.slogdet(mean)[1]))
 
 
 def refined(part: Part, state: State, points: Sequence[Point]) -> list[Point]:
@@ -56,7 +69,7 @@ def refined(part: Part, state: State, points: Sequence[Point]) -> list[Point]:
     name = _scale(part, points)
     if name is None:
         return list(points)
-    found = [_Placed(point, *place) for point, place in zip(points, _places(points, name), strict=True)]
+    found = [_Placed(_scaled(one.variant, one.sizes), *place) for one, place in zip(points, _places(points, name), strict=True)]
     for line in sorted({one.line for one in found}):
         for down in (True, False):
             found += _beyond(part, state, name, sorted((one for one in found if one.line == line), key=lambda one: one.place), found, down)
@@ -168,7 +181,7 @@ def _made(part: Part, state: State, name: str, like: _Placed, value: float, plac
         return None
     if variant is None or variant.values.get(name) != value:
         return None
-    return _Placed(Point(variant, part_mixture(part, state, variant)), like.line, place)
+    return _Placed(_scaled(variant, part_mixture(part, state, variant)), like.line, place)
 
 
 def _shared(found: Sequence[_Placed]) -> list[Point]:

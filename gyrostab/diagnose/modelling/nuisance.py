@@ -76,9 +76,8 @@ def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, 
 
 
 def _merged(points: Sequence[Point]) -> Mixture:
-    log_weight = np.concatenate([point.sizes.log_weight + math.log(point.share) for point in points])
-    mean, covariance = (np.concatenate([getattr(point.sizes, name) for point in points]) for name in ("mean", "covariance"))
-    return Mixture(log_weight, mean, covariance)
+    several = [point.weighed() for point in points]
+    return Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
 
 
 def _family(part: Part, naming: Naming) -> list[Variant]:
