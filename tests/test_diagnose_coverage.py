@@ -12,6 +12,7 @@ from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.effects.cells import begin_state
 from gyrostab.diagnose.effects.explained import explain_away
 from gyrostab.diagnose.locating.ensemble import null_records
+from gyrostab.diagnose.modelling.limits import limits
 from gyrostab.diagnose.modelling.refit import fit_claims
 from tests.named import WORLD, record
 from tests.test_diagnose_refit import claimed
@@ -92,3 +93,21 @@ def test_a_play_between_those_of_the_grid_is_held():
     assert 0.9 <= held(found, "sensitivity", size) <= 1.0
     assert 0.9 <= held(found, "width", width) <= 1.0
     assert half_width(found, "sensitivity") < 0.4 * size
+
+
+def test_what_is_there_but_slower_than_others_is_below_its_limit():
+    size, time = 0.25, 700.0
+    heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
+    environment = ({"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT}, WORLD["usual"][1])
+    reduced = record([], environment=environment)
+    baseline = calibrate(reduced)
+    frame = claimed(reduced, baseline, "shupe", "mean", ("sensitivity",))
+    frame = replace(frame, claims=(), candidates=tuple(one for one in frame.candidates if one.effect == "shupe"))
+    drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
+    there = in_blocks(size * slow(60.0 * np.gradient(heat), time))
+    found = []
+    for number in range(RECORDS):
+        seen = reduced.assign(mean=drawn["mean"].isel(record=number).transpose("axis", "block") + there)
+        found.append(limits(replace(frame, state=begin_state(seen, baseline)))["shupe"].upper_limit)
+    assert np.mean(np.array(found) >= size) >= 0.9
+    assert np.median(found) < 4.0 * size

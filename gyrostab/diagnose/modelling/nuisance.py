@@ -17,7 +17,7 @@ from gyrostab.diagnose.naming.claims import Naming
 from gyrostab.diagnose.naming.name import AMBIGUOUS, FORM
 from gyrostab.physics.registry import effects
 
-__all__ = ["sizes_over"]
+__all__ = ["plain_places", "sizes_over"]
 
 Array = NDArray[np.float64]
 _AT_ONCE = 1e-2  # s: a lag that is as good as none
@@ -88,12 +88,16 @@ def _family(part: Part, naming: Naming) -> list[Variant]:
     return [one for one in candidate.variants if one.columns == part.variant.columns and one.squared == part.variant.squared]
 
 
-def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
-    """Places of the variants with the default of every parameter that the grid has it of, but lags, unless others are clearly better."""
-    known = {item.name: item.default for item in effects()[part.candidate.effect].parameters()}
+def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
+    """Places of the variants with the default of every parameter that the grid has it of, but lags: their sizes are of one unit."""
+    known = {item.name: item.default for item in effects()[effect].parameters()}
     tried = {name for name in known if not _is_lag(name) and any(one.values.get(name) == known[name] for one in family)}
-    plain = [place for place, one in enumerate(family) if all(one.values.get(name, known[name]) == known[name] for name in tried)]
-    top = max(evidence)
+    return [place for place, one in enumerate(family) if all(one.values.get(name, known[name]) == known[name] for name in tried)]
+
+
+def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
+    """Places of the plain variants, unless others are clearly better."""
+    plain, top = plain_places(part.candidate.effect, family), max(evidence)
     return plain if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS else list(range(len(family)))
 
 
