@@ -95,6 +95,7 @@ def mean_effect(
     tau: tuple[float, float] | None = None,
     active: NDArray[np.bool_] | None = None,
     regressor: tuple[str, Array, str] | None = None,
+    unless: tuple[str, ...] = (),
     **more: Any,
 ) -> Effect:
     """An effect that adds ``shape * shares``, scaled to `strength`.
@@ -112,6 +113,8 @@ def mean_effect(
         See `Effect`.
     regressor : (str, ndarray, str), optional
         Name of a parameter, the driver it multiplies (time,) and its unit: its value on every axis is the projection of the mean.
+    unless : tuple of str
+        Terms that bend the response: where one of them is claimed beside the parameter, that is the slope at another place.
 
     Returns
     -------
@@ -124,7 +127,7 @@ def mean_effect(
     parameters["size_white"] = {"value": mean_size(world, mean, white=True), "unit": "1"}
     if regressor is not None:
         values = {axis: projection(world, mean[i], regressor[1], axis=i) for i, axis in enumerate(AXES) if shares[i]}
-        parameters[regressor[0]] = {"values": values, "unit": regressor[2]}
+        parameters[regressor[0]] = {"values": values, "unit": regressor[2]} | ({"unless": list(unless)} if differs and unless else {})
     return Effect(
         name=name,
         axes=named(shares),
