@@ -71,10 +71,11 @@ def refined(part: Part, state: State, points: Sequence[Point]) -> list[Point]:
         return list(points)
     found = [_Placed(_scaled(one.variant, one.sizes), *place) for one, place in zip(points, _places(points, name), strict=True)]
     for line in sorted({one.line for one in found}):
-        for down in (True, False):
-            found += _beyond(part, state, name, sorted((one for one in found if one.line == line), key=lambda one: one.place), found, down)
+        members = sorted((one for one in found if one.line == line), key=lambda one: one.place)
+        for down in (True, False) if len(members) > 1 else ():
+            found += _beyond(part, state, name, members, found, down)
     for _ in range(_ROUNDS):
-        steps = _wide(found)[: _MOST - len(found) + len(points)]
+        steps = _wide(found)[: max(_MOST - len(found) + len(points), 0)]
         new = [made for one, other in steps if (made := _middle(part, state, name, one, other)) is not None]
         if not new:
             break
@@ -134,7 +135,7 @@ def _wide(found: Sequence[_Placed]) -> list[tuple[_Placed, _Placed]]:
     out = []
     for one, other in _neighbours(found):
         likely = max(one.point.evidence, other.point.evidence) > top - _LIKELY
-        if (first and best in (one, other)) or (likely and _differ(one.point, other.point)):
+        if (first and (best is one or best is other)) or (likely and _differ(one.point, other.point)):
             out.append((one, other))
     return sorted(out, key=lambda pair: -max(one.point.evidence for one in pair))
 
