@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 FORM_ERROR = 0.04
 _TWO_SIDED = 1.959964
 _ANGLE = "deg"
+_PLACE = "line", "frequency"  # where a line is has nothing to do with what makes it
 _EARTH = 15.041067  # deg/h
 
 
@@ -168,7 +169,7 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
     for name, (mean, sd, *ends) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
         if math.isfinite(mean) and not math.isnan(sd):  # a low-pass of infinite bandwidth is none; an exponent may be told, not measured
-            form = 0.0 if unit == _ANGLE else FORM_ERROR * mean  # angles have that of the size already
+            form = 0.0 if unit == _ANGLE or (view, name) == _PLACE else FORM_ERROR * mean  # angles have that of the size already
             estimates[name] = _estimate(mean, sd, unit, ends=ends, positive=_positive(kind, name), form=form)
         _put(values, name, mean, axes)
     values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
