@@ -47,8 +47,8 @@ def cell_widths(values: Array, step: float) -> tuple[Array, Array]:
     Examples
     --------
     >>> noise = np.random.default_rng(1).standard_normal(60_000)
-    >>> [cell_widths(how(noise / 0.2) * 0.2, 0.2)[0].round(1) for how in (np.rint, np.floor, np.trunc)]
-    [array([1., 1.]), array([1., 1.]), array([2., 1.])]
+    >>> [cell_widths(how(noise / 0.2) * 0.2, 0.2)[0].round().tolist() for how in (np.rint, np.floor, np.trunc)]
+    [[1.0, 1.0], [1.0, 1.0], [2.0, 1.0]]
     """
     nothing = np.full(2, np.nan)
     finite = values[np.isfinite(values)]
