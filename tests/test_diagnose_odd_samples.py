@@ -108,6 +108,20 @@ def test_samples_that_were_filled_with_zeros_are_seen_where_an_axis_is_lost():
     assert float(reduced["filled"].sel(axis="x").sum()) == pytest.approx(120, abs=25)
 
 
+def test_an_axis_that_is_lost_early_keeps_blocks_where_all_that_are_left_have_odd_samples():
+    """Of 92 blocks z has 20, with zeros in each: without them nothing would be left of it."""
+    rng = np.random.default_rng(104)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    noise[2, 3_240:] = np.nan
+    for first in range(100, 3_240, 162):
+        noise[:, first : first + 6] = 0.0
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    assert (reduced["filled"].sel(axis="z") > 0).sum() == np.isfinite(reduced["mean"].sel(axis="z")).sum() == 20
+    baseline, records = nulls(reduced, 40)
+    (claim,) = name_effects(reduced, baseline, records).claims
+    assert (claim.effect, claim.axes) == ("held_samples", ("x", "y", "z"))
+
+
 @pytest.mark.parametrize("fill", ["repeat", "zero"])
 def test_how_often_and_how_long_samples_were_held_is_told(fill):
     """Held stretches drawn here, 40 of 6 samples each and 20 of 2."""
