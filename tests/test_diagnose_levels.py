@@ -1,5 +1,7 @@
 """A bias that hops between two levels in the block means: what it gains, what else gains nothing, and what a diagnosis makes of it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -191,34 +193,39 @@ def test_what_follows_a_channel_that_may_hop_comes_first(kind: str, gain: float,
     assert followed_first(["telegraph", "bias_jump"], parts, state) == ["telegraph", "bias_jump"]
 
 
-def test_jumps_that_are_hops_themselves_are_none() -> None:
-    """The first hop and the last one were taken for jumps; and a jump four times as large is one."""
+REAL, HOP = 41, -1  # blocks: a jump of another size than the hops; and the last hop
+
+
+@pytest.mark.parametrize(
+    ("size", "places", "kept"),
+    [(0.0, (0, HOP), ()), (3.0, (REAL,), (REAL,)), (3.0, (REAL, HOP), (REAL,))],
+    ids=["none", "one", "one of two"],
+)
+def test_jumps_that_are_hops_themselves_are_none(size: float, places: tuple[int, ...], kept: tuple[int, ...]) -> None:
+    """The first hop and the last one were taken for jumps before the hops were named; a jump that is four times as large is one."""
     rng = np.random.default_rng(12)
     course = hops(rng, 150.0, 200.0)
-    first, last = (np.flatnonzero(np.abs(np.diff(course)) > 0.5)[[0, -1]] + 1).tolist()
-    for size, kept in ((0.0, False), (3.0, True)):
-        mean = 0.7 * course + size * (np.arange(BLOCKS) >= 41) + white(rng, 1)[0]
-        start = state_of(mean)
-        places = (41,) if kept else (first, last)
-        candidate = part(start, course).candidate
+    moves = np.flatnonzero(np.abs(np.diff(course)) > 0.5) + 1
+    start = state_of(0.7 * course + size * (np.arange(BLOCKS) >= REAL) + white(rng, 1)[0])
+    candidate = part(start, course).candidate
 
-        def again(_: object, state: State, candidate: Candidate = candidate) -> list[Found]:
-            columns = state.given.get(("mean", "x"), [])
-            gain, found = level_gains(state.reduced, state.baseline, axis="x", given=np.stack(columns, axis=-1) if columns else None)
-            return [Found(candidate, [("x",)], gain[:, None], (Variant({}, ("step",), found.share[0][None, None]),))]
+    def gains(_: object, state: State) -> list[Found]:
+        columns = state.given.get(("mean", "x"), [])
+        gain, found = level_gains(state.reduced, state.baseline, axis="x", given=np.stack(columns, axis=-1) if columns else None)
+        return [Found(candidate, [("x",)], gain[:, None], (Variant({}, ("step",), found.share[0][None, None]),))]
 
-        def state_with(some: object, start: State = start) -> State:
-            return take_parts(start, [one for claim in some for one in claim.parts])
+    def state_with(some: Sequence[Claim]) -> State:
+        return take_parts(start, [one for claim in some for one in claim.parts])
 
-        jumps = [jump(place, 20.0) for place in places]
-        first_of_all = Claim("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
-        (beside,) = again((), state_with([first_of_all]))
-        gain = float(beside.gain[0, 0])
-        hopping = Claim("telegraph", (), ("x",), (Part(candidate, beside.best[0], ("x",), gain),), gain, 8.0)
-        left = hops_alone([first_of_all, hopping], state_with, again, 8.0)
-        assert [one.effect for one in left] == (["bias_jump", "telegraph"] if kept else ["telegraph"])
-        share = left[-1].parts[0].variant.design[0, 0]
-        assert np.abs(np.corrcoef(share, course)[0, 1]) > 0.98
+    jumps = [jump(place if place == REAL else int(moves[place]), 20.0) for place in places]
+    first = Claim("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
+    (beside,) = gains((), state_with([first]))
+    gain = float(beside.gain[0, 0])
+    hopping = Claim("telegraph", (), ("x",), (Part(candidate, beside.best[0], ("x",), gain),), gain, 8.0)
+    left = hops_alone([first, hopping], state_with, gains, 8.0)
+    assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
+    assert [one.variant.values["at"] for one in left[0].parts if one.candidate.effect == "bias_jump"] == [place * STEP for place in kept]
+    assert np.abs(np.corrcoef(left[-1].parts[0].variant.design[0, 0], course)[0, 1]) > 0.98
 
 
 @pytest.fixture(scope="module")

@@ -75,28 +75,40 @@ def hops_alone(
     out = list(chosen)
     for part in [part for one in chosen for part in one.parts if part.candidate.view == _VIEW]:
         jumps = _jumps_beside(part, out, state_with([]))
-        if not jumps:
-            continue
-        others = [one for one in (_without(one, [*jumps, part]) for one in out) if one is not None]
-        alone = _sought(part, gains([part.candidate], state_with(others)))
-        if part.gain + sum(jump.gain for jump in jumps) < alone.gain + threshold:
-            kept = [one for one in (_without(one, jumps) for one in out) if one is not None]
-            out = [replace(one, parts=tuple(alone if each is part else each for each in one.parts)) for one in kept]
+        for some in [jumps, *([one] for one in jumps if len(jumps) > 1)]:
+            if not some or not _holds(out, some):
+                continue
+            alone = _sought(part, gains([part.candidate], state_with(_without(out, [*some, part]))))
+            if part.gain + sum(jump.gain for jump in some) < alone.gain + threshold:
+                out = [_with_part(one, part, alone) for one in _without(out, some)]
+                part = alone
     return out
+
+
+def _holds(chosen: Sequence[Claim | Unknown], parts: Sequence[Part]) -> bool:
+    return all(any(part is own for one in chosen for own in one.parts) for part in parts)
+
+
+def _with_part(claim: Claim | Unknown, part: Part, instead: Part) -> Claim | Unknown:
+    return replace(claim, parts=tuple(instead if own is part else own for own in claim.parts))
 
 
 def _jumps_beside(part: Part, chosen: Sequence[Claim | Unknown], state: State) -> list[Part]:
     return [one for claim in chosen for one in claim.parts if one.row == part.row and jumps_at_will(one, state)]
 
 
-def _without(claim: Claim | Unknown, left_out: Sequence[Part]) -> Claim | Unknown | None:
-    """A claim without some of its parts; None where nothing is left of it."""
-    kept = tuple(part for part in claim.parts if not any(part is one for one in left_out))
-    if len(kept) == len(claim.parts):
-        return claim
-    order = list(claim.axes)
-    gain = claim.gain - sum(part.gain for part in claim.parts) + sum(part.gain for part in kept)
-    return replace(claim, parts=kept, axes=axes_of(kept, order), gain=gain) if kept else None
+def _without(chosen: Sequence[Claim | Unknown], left_out: Sequence[Part]) -> list[Claim | Unknown]:
+    """What is chosen without some of its parts; claims of which nothing is left are none."""
+    out = []
+    for one in chosen:
+        kept = tuple(part for part in one.parts if not any(part is other for other in left_out))
+        if len(kept) < len(one.parts):
+            gain = one.gain - sum(part.gain for part in one.parts) + sum(part.gain for part in kept)
+            one = replace(one, parts=kept, axes=axes_of(kept, list(one.axes)), gain=gain)
+            if not kept:
+                continue
+        out.append(one)
+    return out
 
 
 def _sought(part: Part, found: Sequence[Found]) -> Part:
