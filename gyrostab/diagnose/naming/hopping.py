@@ -11,6 +11,7 @@ from gyrostab.diagnose.effects.cells import State
 from gyrostab.diagnose.effects.designs import Candidate
 from gyrostab.diagnose.effects.explained import Part, mean_columns
 from gyrostab.diagnose.effects.search import Found
+from gyrostab.diagnose.gains.levels import level_gains
 from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown
 from gyrostab.diagnose.naming.jumps import jumps_at_will
 from gyrostab.diagnose.naming.parts import axes_of, gain_of
@@ -47,8 +48,15 @@ def _share_of(part: Part, other: Part, state: State) -> float:
 
 
 def hopping(passing: list[str], parts: Mapping[str, Sequence[Part]], state: State) -> list[str]:
-    """Keys of biases that hop within blocks, unless a mean that follows a channel may be why."""
-    return [key for key in followed_first(passing, parts, state) if any(part.variant.inside.size for part in parts[key])]
+    """Keys of biases that hop within blocks, unless a mean that follows a channel may be why; once on an axis.
+
+    What hops beside hops that are named is no reason for powers and tails that these have not taken yet, and may be a jump.
+    """
+    return [
+        key
+        for key in followed_first(passing, parts, state)
+        if any(part.variant.inside.size and not state.given.get(("inner", part.row[0])) for part in parts[key])
+    ]
 
 
 def hops_alone(
@@ -78,11 +86,20 @@ def hops_alone(
         for some in [jumps, *([one] for one in jumps if len(jumps) > 1)]:
             if not some or not _holds(out, some):
                 continue
-            alone = _sought(part, gains([part.candidate], state_with(_without(out, [*some, part]))))
-            if part.gain + sum(jump.gain for jump in some) < alone.gain + threshold:
-                out = [_with_part(one, part, alone) for one in _without(out, some)]
-                part = alone
+            beside, alone = (state_with(_without(out, left_out)) for left_out in ([part], [part, *some]))
+            own = _of_blocks(part, beside)
+            if np.isfinite(own) and own + sum(jump.gain for jump in some) < _of_blocks(part, alone) + threshold:
+                instead = _sought(part, gains([part.candidate], alone))
+                out = [_with_part(one, part, instead) for one in _without(out, some)]
+                part = instead
     return out
+
+
+def _of_blocks(part: Part, state: State) -> float:
+    """What two levels gain in the means of blocks [nats], which can be compared: those of pieces know more, and are not always there."""
+    given = state.given.get(("mean", part.row[0]))
+    gain, _ = level_gains(state.reduced, state.baseline, axis=part.row[0], given=np.stack(given, axis=-1) if given else None)
+    return float(gain[0])
 
 
 def _holds(chosen: Sequence[Claim | Unknown], parts: Sequence[Part]) -> bool:

@@ -221,7 +221,7 @@ class _Search:
         parts = without_lines(by_key(found))
         need = {key: self.threshold + form_error(several, [*self.expected, *chosen], share=FORM) for key, several in parts.items()}
         for key in [key for key in parts if not key.startswith("~") and gain_sum(parts[key]) > need[key]]:
-            parts[key] = possible(parts[key], state)
+            parts[key] = possible(parts[key], state, error=need[key] - self.threshold)
         ranked = sorted(parts, key=lambda key: -gain_sum(parts[key]))
         passing = [key for key in ranked if gain_sum(parts[key]) > need[key]]
         odd = [key for key in passing if parts[key][0].candidate.view == "marks" and not key.startswith("~")]

@@ -58,9 +58,12 @@ def without_pulses(chosen: Sequence[Claim | Unknown]) -> list[Claim | Unknown]:
     return out
 
 
-def possible(parts: Sequence[Part], state: State) -> list[Part]:
-    """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not."""
-    return [part for part in parts if _possible(part, state)] if on_all_axes(parts, state) and sudden(parts, state) else []
+def possible(parts: Sequence[Part], state: State, *, error: float = 0.0) -> list[Part]:
+    """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not.
+
+    `error` is what errors of the form of all else that is named may leave to the effect [nats].
+    """
+    return [part for part in parts if _possible(part, state)] if on_all_axes(parts, state) and sudden(parts, state, error=error) else []
 
 
 def plainer_effect(parts: Sequence[Part], state: State) -> str | None:
