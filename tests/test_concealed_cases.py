@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.signal import lfilter
 
 import gyrostab
 from gyrostab.concealed import channel_detector, make_case, open_truth, plan_case, plan_cases, salt, seal
@@ -20,6 +21,7 @@ from gyrostab.concealed.record import signal
 from gyrostab.concealed.salt import counts_of
 from gyrostab.concealed.seal import truth_text
 from gyrostab.concealed.sever import sever
+from gyrostab.concealed.shapes import following
 from gyrostab.concealed.visible import FAINT
 from gyrostab.concealed.wander import wander_size
 from gyrostab.concealed.world import AXES, draw_world, stream
@@ -49,6 +51,44 @@ def test_limit_of_a_mean_is_the_closed_form():
     effective = 300 * (1 - 300 / 2000)
     smallest = 60 * 0.004 * math.sqrt(2 * NATS / effective)
     assert mean_size(world, mean * smallest) == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(("size", "time"), [(0.3, 80.0), (-0.05, 15.0), (2.0, 0.0)])
+def test_nearest_follower_of_a_driver_has_the_sensitivity_at_rest_and_its_lag(size, time):
+    world = replace(white_world(), missing=np.arange(20_000) % 7 < 2)
+    step = np.where(np.arange(world.temperature.size) >= 600, 1.5, 0.0)
+    since = np.maximum(np.arange(world.size) / world.rate - 600.0, 0.0)
+    mean = 1.5 * size * (1.0 - np.exp(-since / time)) if time else 1.5 * size * np.interp(since, [0, 1e-9], [0, 1])
+    found = following(world, np.asarray(mean), step, axis=0)
+    assert found[0] == pytest.approx(size, rel=0.01)
+    assert found[1] == pytest.approx(time, abs=1.5)  # the driver has one value a second
+
+
+def test_true_numbers_of_a_slow_supply_leave_next_to_nothing_of_it():
+    """What follows the voltage at once leaves a tenth and more of it."""
+    world = white_world()
+    slow = [e for s in range(12) if (e := CATALOGUE["supply_bias"].make(world, stream(s, "slow"), strength=4.0)).differs]
+    volt = np.repeat(world.supply, 10)[: world.size]
+    assert len(slow) >= 4
+    for effect in slow:
+        for axis in effect.axes:
+            seen = effect.mean[AXES.index(axis)]
+            size, late = (effect.parameters[name]["values"][axis] for name in ("voltage", "lag"))
+            decay = math.exp(-0.1 / late)
+            followed = volt[0] + lfilter([1 - decay], [1, -decay], volt - volt[0])
+            assert np.var(seen - size * followed) < 0.05 * np.var(seen)
+
+
+@pytest.mark.parametrize(
+    ("name", "term"), [("temperature_bias", "quadratic"), ("vibration_rectification", "quartic"), ("scale_factor", "cubic")]
+)
+def test_a_bent_response_is_not_compared_with_one_term_of_several(name, term):
+    world = draw_world(np.random.default_rng(3), rate=10.0, seconds=900.0)
+    world = replace(world, rotation=np.maximum(world.rotation, 1e-3 * np.arange(world.rotation.size)))
+    made = [CATALOGUE[name].make(world, stream(s, "bend"), strength=4.0) for s in range(12)]
+    marks = {effect.differs: [one.get("unless", ()) for one in effect.parameters.values()] for effect in made}
+    assert any(term in one for one in marks[True])
+    assert not any(marks[False])
 
 
 @pytest.mark.parametrize(("frequency", "least", "most"), [(0.5, 0.8, 1.0), (1 / 4000, 0.0, 0.2)], ids=["fast", "slow"])

@@ -14,7 +14,7 @@ from gyrostab.concealed import light, loop, telemetry
 from gyrostab.concealed.environment import lag
 from gyrostab.concealed.floor import white_level
 from gyrostab.concealed.limits import NATS, shared_size
-from gyrostab.concealed.shapes import by_axis, mean_effect, named, on_axes, variance_effect
+from gyrostab.concealed.shapes import by_axis, following, mean_effect, named, on_axes, variance_effect
 from gyrostab.concealed.world import AXES, Effect, World, to_samples
 
 __all__ = [
@@ -54,7 +54,7 @@ def supply_bias(world: World, rng: np.random.Generator, *, strength: float) -> E
     slow = rng.random() < 0.5
     v = world.supply - world.supply.mean()
     shape = lag(v - 0.3 * np.minimum(v, 0) ** 2, rng.uniform(5, 120)) if slow else v
-    return mean_effect(
+    effect = mean_effect(
         world,
         to_samples(world, shape),
         on_axes(rng),
@@ -65,6 +65,11 @@ def supply_bias(world: World, rng: np.random.Generator, *, strength: float) -> E
         differs=slow,
         regressor=("voltage", to_samples(world, v), "deg/h/V"),
     )
+    if slow and effect.mean is not None:  # the diagnosis follows a voltage with a lag, straight
+        found = {axis: following(world, effect.mean[AXES.index(axis)], v, axis=AXES.index(axis)) for axis in effect.axes}
+        effect.parameters["voltage"] = {"values": {axis: slope for axis, (slope, _) in found.items()}, "unit": "deg/h/V"}
+        effect.parameters["lag"] = {"values": {axis: late for axis, (_, late) in found.items()}, "unit": "s"}
+    return effect
 
 
 def bias_jump(world: World, rng: np.random.Generator, *, strength: float) -> Effect:

@@ -50,6 +50,7 @@ def temperature_bias(world: World, rng: np.random.Generator, *, strength: float)
         form=form,
         differs=bend,
         regressor=regressor,
+        unless=("quadratic", "cubic"),
     )
 
 

@@ -38,6 +38,7 @@ def vibration_rectification(world: World, rng: np.random.Generator, *, strength:
         differs=not (exponent == 2.0 and math.isinf(saturation)),
         active=world.busy,
         regressor=("sensitivity", to_samples(world, world.vibration**2), "deg/h/g^2"),
+        unless=("quartic",),
     )
 
 
@@ -205,6 +206,7 @@ def scale_factor(world: World, rng: np.random.Generator, *, strength: float) -> 
         differs=bend,
         active=_turning(world),
         regressor=("linear", to_samples(world, world.rotation, dt=QUICK) * 3600.0 * 1e-6, "ppm"),
+        unless=("asymmetry", "cubic"),
     )
 
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.optimize import minimize_scalar
 
+from gyrostab.concealed.environment import lag
 from gyrostab.concealed.limits import NATS, amplitude_for, line_density_of, mean_size, variance_gain, variance_size
-from gyrostab.concealed.world import AXES, Effect, World
+from gyrostab.concealed.world import AXES, Effect, World, to_samples
 
-__all__ = ["by_axis", "mean_effect", "named", "on_axes", "projection", "variance_effect"]
+__all__ = ["by_axis", "following", "mean_effect", "named", "on_axes", "projection", "variance_effect"]
 
 Array = NDArray[np.float64]
+_SHORTEST, _LAGS = 1.0, 24  # lags that are tried: the first [s], and how many
 
 
 def on_axes(rng: np.random.Generator, *, alone: float = 0.6) -> Array:
@@ -39,10 +43,43 @@ def by_axis(shares: Array, value: float) -> dict[str, float]:
 
 def projection(world: World, mean: Array, driver: Array, *, axis: int) -> float:
     """Sensitivity of a mean (time,) to a driver (time,) by least squares in the noise of an axis: what a linear model should find."""
+    return _nearest(world, mean, driver, axis=axis)[0]
+
+
+def following(world: World, mean: Array, driver: Array, *, axis: int) -> tuple[float, float]:
+    """Sensitivity and lag [s] of what follows a driver (second,) and comes nearest to a mean (time,), by least squares in the noise.
+
+    The sensitivity is that to a driver that stands. To the driver at once a mean that is late has another one, less by as much as the noise
+    makes of the steps of the driver: no number of the instrument's.
+
+    Examples
+    --------
+    >>> from gyrostab.concealed.world import draw_world
+    >>> world = draw_world(np.random.default_rng(0), rate=10.0, seconds=900.0)
+    >>> mean = to_samples(world, 0.2 * lag(world.supply, 40.0))
+    >>> [round(number, 2) for number in following(world, mean, world.supply, axis=0)]
+    [0.2, 40.0]
+    """
+
+    def late(time: float) -> tuple[float, float]:
+        return _nearest(world, mean, to_samples(world, lag(driver, time)), axis=axis)
+
+    grid = np.append(0.0, np.geomspace(_SHORTEST, world.seconds, _LAGS))
+    place = int(np.argmin([late(float(time))[1] for time in grid]))
+    if place == 0:
+        return late(0.0)[0], 0.0
+    ends = math.log(grid[max(place - 1, 1)]), math.log(grid[min(place + 1, _LAGS)])
+    time = math.exp(float(minimize_scalar(lambda log: late(math.exp(log))[1], bounds=ends, method="bounded").x))
+    return late(time)[0], time
+
+
+def _nearest(world: World, mean: Array, driver: Array, *, axis: int) -> tuple[float, float]:
+    """Sensitivity of a mean (time,) to a driver (time,), and the share of the mean that this leaves, by least squares in the noise."""
     there = ~world.missing
     x, y = (fft.dct(np.where(there, values - values[there].mean(), 0.0), norm="ortho")[1:] for values in (driver, mean))
     weight = 1.0 / line_density_of(world, axis=axis)
-    return float((weight * x * y).sum() / (weight * x * x).sum())
+    slope = float((weight * x * y).sum() / (weight * x * x).sum())
+    return slope, float((weight * (y - slope * x) ** 2).sum() / (weight * y * y).sum())
 
 
 def mean_effect(
@@ -58,6 +95,7 @@ def mean_effect(
     tau: tuple[float, float] | None = None,
     active: NDArray[np.bool_] | None = None,
     regressor: tuple[str, Array, str] | None = None,
+    unless: tuple[str, ...] = (),
     **more: Any,
 ) -> Effect:
     """An effect that adds ``shape * shares``, scaled to `strength`.
@@ -75,6 +113,8 @@ def mean_effect(
         See `Effect`.
     regressor : (str, ndarray, str), optional
         Name of a parameter, the driver it multiplies (time,) and its unit: its value on every axis is the projection of the mean.
+    unless : tuple of str
+        Terms that bend the response: where one of them is claimed beside the parameter, that is the slope at another place.
 
     Returns
     -------
@@ -87,7 +127,7 @@ def mean_effect(
     parameters["size_white"] = {"value": mean_size(world, mean, white=True), "unit": "1"}
     if regressor is not None:
         values = {axis: projection(world, mean[i], regressor[1], axis=i) for i, axis in enumerate(AXES) if shares[i]}
-        parameters[regressor[0]] = {"values": values, "unit": regressor[2]}
+        parameters[regressor[0]] = {"values": values, "unit": regressor[2]} | ({"unless": list(unless)} if differs and unless else {})
     return Effect(
         name=name,
         axes=named(shares),

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.effects.cells import State, pair_rows
-from gyrostab.diagnose.effects.designs import Candidate
+from gyrostab.diagnose.effects.designs import Candidate, Variant
 from gyrostab.diagnose.effects.explained import Part, mean_columns
 from gyrostab.diagnose.effects.sizes import part_mixture
+from gyrostab.diagnose.modelling.nuisance import plain_places
 from gyrostab.diagnose.naming.claims import Naming
 from gyrostab.physics.registry import effects
 
 __all__ = ["Limit", "limits"]
 
-_ONE_SIDED = 1.644854  # standard errors
+_LEVEL = 0.95
+_MOST = 9  # variants
+_ONE_SIDED = float(ndtri(_LEVEL))  # standard errors
 
 
 @dataclass(frozen=True)
@@ -57,22 +63,38 @@ def limits(naming: Naming) -> dict[str, Limit]:
 
 
 def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
-    """Limit of the first parameter at the middle of its nuisance grid, largest over the rows."""
+    """Limit of the first parameter over the lags, times and plays of its grid, each as likely as the record says, largest over the rows."""
     if not candidate.variants[0].columns:
         return math.nan, ""
-    first = [one for one in candidate.variants if one.columns == candidate.variants[0].columns]
-    variant = first[len(first) // 2]
+    family = _told_over(candidate, [one for one in candidate.variants if one.columns == candidate.variants[0].columns])
     rows = pair_rows(state.reduced) if candidate.view == "cross" else [(axis,) for axis in state.axes]
-    worst = -math.inf
-    for row in rows:
-        number = state.axes.index(row[0])
-        if candidate.view == "mean" and not np.ptp(mean_columns(variant, number)[0]) > 0.0:
-            continue
-        mean, covariance = part_mixture(Part(candidate, variant, row, 0.0), state).moments()
-        value, sd = float(mean[0]), math.sqrt(max(float(covariance[0, 0]), 0.0))
-        if not math.isfinite(sd):
-            continue
-        size = max(value, 0.0) if variant.squared and candidate.view == "power" else abs(value)  # a product of two axes has either sign
-        bound = size + _ONE_SIDED * sd
-        worst = max(worst, math.sqrt(bound) if variant.squared else bound)
-    return (worst if worst > -math.inf else math.nan), variant.columns[0]
+    found = [_of_row(Part(candidate, family[0], row, 0.0), family, state) for row in rows]
+    known = [bound for bound in found if math.isfinite(bound)]
+    worst = max(known) if known else math.nan
+    return (math.sqrt(worst) if family[0].squared else worst), family[0].columns[0]
+
+
+def _told_over(candidate: Candidate, family: Sequence[Variant]) -> Sequence[Variant]:
+    """Of means some plain variants, evenly over the grid; of others the one in its middle: the sizes of the rest have other meanings."""
+    plain = [family[place] for place in plain_places(candidate.effect, family)] if candidate.view == "mean" else []
+    every = -(-len(plain) // _MOST)
+    return plain[every // 2 :: every] if plain else [family[len(family) // 2]]
+
+
+def _of_row(part: Part, family: Sequence[Variant], state: State) -> float:
+    """The number that the size, or its square, is below at 95 %, on an axis or a pair; NaN where the record cannot tell."""
+    moves = [one for one in family if part.candidate.view != "mean" or np.ptp(mean_columns(one, state.axes.index(part.row[0]))[0]) > 0.0]
+    sizes = [part_mixture(part, state, one) for one in moves]
+    moments = [(float(mean[0]), math.sqrt(max(float(square[0, 0]), 0.0))) for mean, square in (one.moments() for one in sizes)]
+    usable = [place for place, (mean, sd) in enumerate(moments) if math.isfinite(mean) and math.isfinite(sd) and sd > 0.0]
+    if not usable:
+        return math.nan
+    mean, sd = np.array([moments[place] for place in usable]).T
+    evidence = np.array([float(np.logaddexp.reduce(sizes[place].log_weight)) for place in usable]) - np.log(sd)
+    share = np.exp(evidence - np.logaddexp.reduce(evidence))
+    one_sided = part.variant.squared and part.candidate.view == "power"  # a product of two axes has either sign
+    size = np.maximum(mean, 0.0) if one_sided else np.abs(mean)
+    ends = size + _ONE_SIDED * sd
+    if np.ptp(ends) <= 1e-9 * ends.max():
+        return float(ends[0])
+    return float(brentq(lambda bound: float(share @ ndtr((bound - size) / sd)) - _LEVEL, ends.min(), ends.max()))

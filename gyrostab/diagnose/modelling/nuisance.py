@@ -12,17 +12,19 @@ from gyrostab.diagnose.effects.candidates import Variant
 from gyrostab.diagnose.effects.cells import State
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.sizes import Mixture, part_mixture
+from gyrostab.diagnose.modelling.between import Point, refined
 from gyrostab.diagnose.naming.claims import Naming
 from gyrostab.diagnose.naming.name import AMBIGUOUS, FORM
 from gyrostab.physics.registry import effects
 
-__all__ = ["sizes_over"]
+__all__ = ["plain_places", "sizes_over"]
 
 Array = NDArray[np.float64]
 _AT_ONCE = 1e-2  # s: a lag that is as good as none
+_TAILS = (0.025, 0.975)
 
 
-def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, dict[str, tuple[float, float]]]:
+def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
     """Sizes of a part, averaged over the noise and over what else is free.
 
     An exponent has its default and a lag is none, unless other values are better by 3 nats and an error of the form. The scatter of the
@@ -41,43 +43,41 @@ def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, 
     mean : ndarray, shape (column,)
     covariance : ndarray, shape (column, column)
         About that mean.
-    nuisance : dict of str to (float, float)
-        Value and standard deviation of the others; NaN for one that is told, but not measured.
+    nuisance : dict of str to (float, float) or (float, float, float, float)
+        Value and standard deviation of the others, and the ends of the 95 % interval where that is not symmetric; NaN for one that is told,
+        but not measured.
     """
-    family = _family(part, naming)
-    several = [part_mixture(part, state, variant) for variant in family]
-    usual = _usual(part, family, _evidence(several))
-    family, several = [family[place] for place in usual], [several[place] for place in usual]
-    evidence = np.array(_evidence(several))
-    whole = _merged(several)
-    mean, covariance = whole.moments()
+    grid = [Point(variant, part_mixture(part, state, variant)) for variant in _family(part, naming)]
+    usual = _usual(part, [point.variant for point in grid], [point.evidence for point in grid])
+    points = refined(part, state, [grid[place] for place in usual])
+    family = [point.variant for point in points]
+    evidence = np.array([point.evidence for point in points])
+    mean, covariance = _merged(points).moments()
     at_once = _at_once(family)
     told = [place for place in at_once if evidence[place] > evidence.max() - AMBIGUOUS - FORM * max(part.gain, 0.0)]
     if told:
-        middle, _ = _merged([several[place] for place in told]).moments()
+        middle, _ = _merged([points[place] for place in told]).moments()
         mean, covariance = middle, covariance + np.outer(middle - mean, middle - mean)
-    share = np.exp(evidence - np.logaddexp.reduce(evidence))
-    nuisance = {}
+    weighed = evidence + np.log([point.share for point in points])
+    share = np.exp(weighed - np.logaddexp.reduce(weighed))
+    nuisance: dict[str, tuple[float, ...]] = {}
     for name in {key for one in family for key, value in one.values.items() if not isinstance(value, str)}:
-        grid = np.array([float(one.values[name]) for one in family])
-        if not np.isfinite(grid).all():
+        tried = np.array([float(one.values[name]) for one in family])
+        if not np.isfinite(tried).all():
             continue
-        if np.ptp(grid) == 0.0:
-            nuisance[name] = (float(grid[0]), math.nan)
+        if np.ptp(tried) == 0.0:
+            nuisance[name] = (float(tried[0]), math.nan)
             continue
         none = bool(told) and _is_lag(name)
-        middle_of = 0.0 if none else float(share @ grid)
-        spread = math.sqrt(float(share @ (grid - middle_of) ** 2))
-        nuisance[name] = (middle_of, max(spread, 0.3 * _spacing(grid, middle_of)))
+        middle_of = 0.0 if none else float(share @ tried)
+        spread = max(math.sqrt(float(share @ (tried - middle_of) ** 2)), 0.3 * _spacing(tried, middle_of))
+        nuisance[name] = (middle_of, spread) if none else (middle_of, spread, *_ends(tried, share, middle_of))
     return mean, covariance, nuisance
 
 
-def _merged(several: Sequence[Mixture]) -> Mixture:
+def _merged(points: Sequence[Point]) -> Mixture:
+    several = [point.weighed() for point in points]
     return Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
-
-
-def _evidence(several: Sequence[Mixture]) -> list[float]:
-    return [float(np.logaddexp.reduce(one.log_weight)) for one in several]
 
 
 def _family(part: Part, naming: Naming) -> list[Variant]:
@@ -88,12 +88,16 @@ def _family(part: Part, naming: Naming) -> list[Variant]:
     return [one for one in candidate.variants if one.columns == part.variant.columns and one.squared == part.variant.squared]
 
 
-def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
-    """Places of the variants with the default of every parameter that the grid has it of, but lags, unless others are clearly better."""
-    known = {item.name: item.default for item in effects()[part.candidate.effect].parameters()}
+def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
+    """Places of the variants with the default of every parameter that the grid has it of, but lags: their sizes are of one unit."""
+    known = {item.name: item.default for item in effects()[effect].parameters()}
     tried = {name for name in known if not _is_lag(name) and any(one.values.get(name) == known[name] for one in family)}
-    plain = [place for place, one in enumerate(family) if all(one.values.get(name, known[name]) == known[name] for name in tried)]
-    top = max(evidence)
+    return [place for place, one in enumerate(family) if all(one.values.get(name, known[name]) == known[name] for name in tried)]
+
+
+def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
+    """Places of the plain variants, unless others are clearly better."""
+    plain, top = plain_places(part.candidate.effect, family), max(evidence)
     return plain if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS else list(range(len(family)))
 
 
@@ -109,6 +113,20 @@ def _lags(values: Mapping[str, float | str]) -> dict[str, float]:
 
 def _is_lag(name: str) -> bool:
     return name == "lag" or name.endswith("_lag")
+
+
+def _ends(tried: Array, share: Array, middle: float) -> tuple[float, float]:
+    """Ends of the 95 % interval: every value stands for all that are nearer to it than to the next, and for as much beyond the last.
+
+    Lags, times and plays are known to a factor, so that there is more room above than below.
+    """
+    known, place = np.unique(tried, return_inverse=True)
+    between = np.where(known[:-1] > known[1:] / 100.0, np.sqrt(known[:-1] * known[1:]), 0.5 * (known[:-1] + known[1:]))
+    first, last = known[0] - (between[0] - known[0]), known[-1] + (known[-1] - between[-1])
+    edge = np.concatenate([[max(first, 0.0)], between, [last]])
+    below = np.append(0.0, np.cumsum(np.bincount(place, weights=share)))
+    low, high = np.interp(_TAILS, below / below[-1], edge)
+    return min(float(low), middle), max(float(high), middle)
 
 
 def _spacing(grid: Array, place: float) -> float:

@@ -256,9 +256,9 @@ def _estimate(mean: float, sd: float, unit: str, *, positive: bool, ends: Sequen
 # ---------------------------------------------------------------------------------------------------------------- sizes
 
 
-def _linear(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+def _linear(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
     """Parameters of means, powers, profiles and transfers; by axis where there are several."""
-    out: dict[str, tuple[float, float]] = {}
+    out: dict[str, tuple[float, ...]] = {}
     for part in parts:
         if part.variant.columns[:1] == ("any",):
             continue
