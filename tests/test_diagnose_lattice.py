@@ -8,8 +8,14 @@ import xarray as xr
 
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model
 from gyrostab.diagnose.calibration.lattice import angle_share, rounded_rates
+from gyrostab.diagnose.effects.candidates import Candidate, Variant
+from gyrostab.diagnose.effects.cells import begin_state
+from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.modelling.refit import fit_claims
 from gyrostab.diagnose.naming.name import name_effects
+from gyrostab.diagnose.naming.structure import structural
 from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.reduction.zero_cell import cut_off, may_be_cut_off
 from gyrostab.log import make_log
 from tests.named import nulls
 
@@ -93,3 +99,56 @@ def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
     found = name_effects(reduced, baseline, records)
     assert [claim.effect for claim in found.claims] == names
     assert ("lattice" in found.reasons.get("rate_quantization", "")) == (kind == "angle")
+
+
+def cut_record(how, *, step: float = 0.18, mean: tuple[float, float] = (0.3, -0.8), zone: float = 0.0, size: int = 24_000) -> xr.Dataset:
+    """White noise on two axes whose samples stand on a lattice, in scatters of a sample; on x a zone in which it sticks before that."""
+    rates = np.array(mean)[:, None] + np.random.default_rng(3).standard_normal((2, size))
+    rates[0] = np.where(np.abs(rates[0]) < zone * step, 0.0, rates[0])
+    return reduce_log(make_log(how(rates / step) * step * SCATTER, rate=10.0, unit="deg/h", axis=["x", "y"]))
+
+
+@pytest.mark.parametrize("step", [0.05, 0.18, 0.5])
+def test_a_rate_that_is_cut_off_towards_zero_is_told_by_the_cell_of_zero(step: float) -> None:
+    for how, cut in ((np.trunc, True), (np.rint, False), (np.floor, False)):
+        reduced = cut_record(how, step=step)
+        assert (cut_off(reduced) == cut).all()
+        assert (may_be_cut_off(reduced) == cut).all()
+        width, error = reduced["cell_width"].values, reduced["cell_width_stderr"].values
+        assert (np.abs(width - [2.0 if cut else 1.0, 1.0]) < 4.0 * error + 0.15).all()
+        assert rounded_rates(reduced, calibrate(reduced)).all() == cut or step > 0.4
+
+
+@pytest.mark.parametrize("zone", [1.0, 2.0])
+def test_what_sticks_at_zero_is_missing_beside_it(zone: float) -> None:
+    reduced = cut_record(np.rint, zone=zone)
+    width = reduced["cell_width"].sel(axis="x", cell="next")
+    assert abs(float(width) - max(1.5 - zone, 0.0)) < 0.1
+    assert not cut_off(reduced).any()
+    assert not may_be_cut_off(reduced).any()
+
+
+@pytest.mark.parametrize(
+    ("how", "zone", "names"), [(np.trunc, 0.0, ["rate_quantization"]), (np.rint, 1.0, ["dead_zone"]), (np.rint, 0.0, [])]
+)
+def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(how, zone: float, names: list[str]) -> None:
+    reduced = cut_record(how, zone=zone, size=15_000)
+    baseline, records = nulls(reduced, 40)
+    found = name_effects(reduced, baseline, records)
+    assert [claim.effect for claim in found.claims] == names
+    assert all(claim.alternatives == () for claim in found.claims)
+    if names == ["rate_quantization"]:
+        assert {one.effect.mode for one in fit_claims(found, baseline) if one.effect} == {"zero"}
+
+
+def test_where_the_cells_do_not_tell_both_names_stand() -> None:
+    """Three standard deviations away a cell holds three of 15 000 samples: nothing tells whether that of zero is twice as wide."""
+    reduced = cut_record(np.rint, step=0.04, mean=(-3.0, 2.8), zone=0.0, size=15_000)
+    assert may_be_cut_off(reduced).all()
+    assert not cut_off(reduced).any()
+    variant = Variant({}, ("stuck",), np.empty(0))
+    part = Part(Candidate("dead_zone", "marks", (), (variant,)), variant, ("x",), 20.0)
+    state = begin_state(reduced, calibrate(reduced))
+    assert "rate_quantization" in structural("dead_zone", [part], state)
+    told = cut_record(np.rint, zone=1.0, size=15_000)
+    assert "rate_quantization" not in structural("dead_zone", [part], begin_state(told, calibrate(told)))

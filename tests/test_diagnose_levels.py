@@ -1,5 +1,7 @@
 """A bias that hops between two levels in the block means: what it gains, what else gains nothing, and what a diagnosis makes of it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -8,10 +10,12 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.effects.candidates import Candidate, Variant
 from gyrostab.diagnose.effects.cells import State
-from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.explained import Part, take_parts
+from gyrostab.diagnose.effects.search import Found
 from gyrostab.diagnose.gains.levels import HOPS, level_courses, level_gains
 from gyrostab.diagnose.modelling.level_sizes import level_sizes
-from gyrostab.diagnose.naming.hopping import followed_first
+from gyrostab.diagnose.naming.claims import Claim
+from gyrostab.diagnose.naming.hopping import followed_first, hops_alone
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.simulate import simulate
 
@@ -156,15 +160,72 @@ def test_sizes_are_those_of_the_course() -> None:
     assert sizes["high"] == (200.0, pytest.approx(200.0 / 3.0))
 
 
-def test_what_follows_a_channel_comes_first() -> None:
-    course = np.ones(BLOCKS)
-    levels = part(state_of(course), course)
+def led(course: np.ndarray, gain: float, axis: str = "x") -> Part:
+    """A mean that follows the temperature."""
     variant = Variant({}, ("sensitivity",), course[None, None])
-    led = Part(Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, ("x",), 20.0)
-    free = Part(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), 20.0)
-    parts = {"telegraph": [levels], "temperature_bias(temperature)": [led], "bias_jump": [free]}
-    assert followed_first(["telegraph", "temperature_bias(temperature)"], parts) == ["temperature_bias(temperature)"]
-    assert followed_first(["telegraph", "bias_jump"], parts) == ["telegraph", "bias_jump"]
+    return Part(Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, (axis,), gain)
+
+
+def jump(place: int, gain: float) -> Part:
+    variant = Variant({"at": place * STEP}, ("step",), (np.arange(BLOCKS) >= place).astype(float)[None, None])
+    return Part(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), gain)
+
+
+FOLLOWS, HOPS_FIRST = ["temperature_bias(temperature)"], ["telegraph", "temperature_bias(temperature)"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "gain", "axis", "expected"),
+    [
+        ("the same", 20.0, "x", FOLLOWS),  # a channel that switches, one block early
+        ("another", 20.0, "x", HOPS_FIRST),
+        ("another", 60.0, "x", FOLLOWS),  # what brings more comes first
+        ("the same", 60.0, "y", HOPS_FIRST),
+    ],
+)
+def test_what_follows_a_channel_that_may_hop_comes_first(kind: str, gain: float, axis: str, expected: list[str]) -> None:
+    rng = np.random.default_rng(10)
+    course = hops(rng, 120.0, 180.0)
+    state = state_of(0.6 * course + white(rng, 1)[0])
+    channel = np.roll(course, 1) if kind == "the same" else np.sin(np.arange(BLOCKS) / 9.0)
+    parts = {"telegraph": [part(state, course)], FOLLOWS[0]: [led(channel, gain, axis)], "bias_jump": [jump(50, 20.0)]}
+    assert followed_first(HOPS_FIRST, parts, state) == expected
+    assert followed_first(["telegraph", "bias_jump"], parts, state) == ["telegraph", "bias_jump"]
+
+
+REAL, HOP = 41, -1  # blocks: a jump of another size than the hops; and the last hop
+
+
+@pytest.mark.parametrize(
+    ("size", "places", "kept"),
+    [(0.0, (0, HOP), ()), (3.0, (REAL,), (REAL,)), (3.0, (REAL, HOP), (REAL,))],
+    ids=["none", "one", "one of two"],
+)
+def test_jumps_that_are_hops_themselves_are_none(size: float, places: tuple[int, ...], kept: tuple[int, ...]) -> None:
+    """The first hop and the last one were taken for jumps before the hops were named; a jump that is four times as large is one."""
+    rng = np.random.default_rng(12)
+    course = hops(rng, 150.0, 200.0)
+    moves = np.flatnonzero(np.abs(np.diff(course)) > 0.5) + 1
+    start = state_of(0.7 * course + size * (np.arange(BLOCKS) >= REAL) + white(rng, 1)[0])
+    candidate = part(start, course).candidate
+
+    def gains(_: object, state: State) -> list[Found]:
+        columns = state.given.get(("mean", "x"), [])
+        gain, found = level_gains(state.reduced, state.baseline, axis="x", given=np.stack(columns, axis=-1) if columns else None)
+        return [Found(candidate, [("x",)], gain[:, None], (Variant({}, ("step",), found.share[0][None, None]),))]
+
+    def state_with(some: Sequence[Claim]) -> State:
+        return take_parts(start, [one for claim in some for one in claim.parts])
+
+    jumps = [jump(place if place == REAL else int(moves[place]), 20.0) for place in places]
+    first = Claim("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
+    (beside,) = gains((), state_with([first]))
+    gain = float(beside.gain[0, 0])
+    hopping = Claim("telegraph", (), ("x",), (Part(candidate, beside.best[0], ("x",), gain),), gain, 8.0)
+    left = hops_alone([first, hopping], state_with, gains, 8.0)
+    assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
+    assert [one.variant.values["at"] for one in left[0].parts if one.candidate.effect == "bias_jump"] == [place * STEP for place in kept]
+    assert np.abs(np.corrcoef(left[-1].parts[0].variant.design[0, 0], course)[0, 1]) > 0.98
 
 
 @pytest.fixture(scope="module")

@@ -162,12 +162,26 @@ def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
     rng = np.random.default_rng(4)
     usual = rng.poisson(0.05, (500, 2, 120))
     mean, spread = expected_counts(usual)
-    np.testing.assert_allclose(mean, 0.05, rtol=0.1)
+    np.testing.assert_allclose(mean.mean(axis=1), 0.05, rtol=0.1)
     np.testing.assert_allclose(spread, 1.0, atol=0.2)
     null = count_gains(usual, mean, spread, subsets(120))
     raised = count_gains(rng.poisson(0.3, (50, 2, 120)), mean, spread, subsets(120))
     assert np.quantile(null, 0.99) < 3.0
     assert raised.min() > 5.0
+
+
+def test_blocks_that_are_lost_are_expected_to_count_nothing():
+    """Half of the blocks are lost: in the others as many as usual are no more than usual, and three times as many are."""
+    rng = np.random.default_rng(5)
+    there = np.arange(120) < 60
+    usual = rng.poisson(1.0 * there, (400, 1, 120))
+    mean, spread = expected_counts(usual)
+    np.testing.assert_allclose([mean[0, there].mean(), mean[0, ~there].mean()], [1.0, 0.0], atol=0.02)
+    assert (mean > 0.0).all()
+    few = count_gains(rng.poisson(0.5 * there, (50, 1, 120)), mean, spread, subsets(120))
+    many = count_gains(rng.poisson(3.0 * there, (50, 1, 120)), mean, spread, subsets(120))
+    assert few.max() < 3.0
+    assert many.min() > 40.0
 
 
 def test_every_line_of_a_comb_is_named():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.conclusion import conclude
@@ -69,6 +70,56 @@ def test_a_pulse_that_comes_again_and_again_is_lines_and_no_spikes():
     found = {claim.effect: claim.axes for claim in name_effects(reduced, baseline, records).claims}
     assert found["spectral_line"] == ("x",)
     assert found["spikes"] == ("y",)
+
+
+def on_a_lattice(held: int, *, seed: int = 21, size: int = 15_000) -> xr.Dataset:
+    """Three axes on a lattice of a seventh of their scatter, on which one sample in twenty is zero; z is lost in the second half.
+
+    `held` stretches of six samples are filled with zeros.
+    """
+    rng = np.random.default_rng(seed)
+    noise = SCATTER * (rng.standard_normal((3, size)) + np.array([[0.3], [-0.4], [0.2]]))
+    noise = np.rint(noise / 0.07) * 0.07
+    for first in rng.choice(np.arange(50, size - 100, 30), held, replace=False):
+        noise[:, first : first + 6] = 0.0
+    noise[2, size // 2 :] = np.nan
+    noise[1, rng.random(size) < 0.1] = np.nan
+    return reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+
+
+def test_zeros_of_a_lattice_are_expected_together_where_an_axis_is_lost():
+    reduced = on_a_lattice(0)
+    zeros, samples = (reduced[name].sum("block").values for name in ("zeros", "samples"))
+    assert (zeros / samples > 0.04).all()
+    lost = reduced["begin"].values > 800.0
+    baseline, records = nulls(reduced, 40)
+    found = name_effects(reduced, baseline, records)
+    assert found.claims == ()
+    drawn = records[0]["filled"].mean("record").values[:, lost].mean(axis=1)
+    np.testing.assert_allclose(drawn[:2], reduced["filled"].values[:2, lost].mean(axis=1), atol=0.12)
+
+
+def test_samples_that_were_filled_with_zeros_are_seen_where_an_axis_is_lost():
+    reduced = on_a_lattice(20)
+    baseline, records = nulls(reduced, 40)
+    (claim,) = name_effects(reduced, baseline, records).claims
+    assert (claim.effect, claim.axes) == ("held_samples", ("x", "y", "z"))
+    assert all(part.variant.columns == ("filled",) for part in claim.parts)
+    assert float(reduced["filled"].sel(axis="x").sum()) == pytest.approx(120, abs=25)
+
+
+def test_an_axis_that_is_lost_early_keeps_blocks_where_all_that_are_left_have_odd_samples():
+    """Of 92 blocks z has 20, with zeros in each: without them nothing would be left of it."""
+    rng = np.random.default_rng(104)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    noise[2, 3_240:] = np.nan
+    for first in range(100, 3_240, 162):
+        noise[:, first : first + 6] = 0.0
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    assert (reduced["filled"].sel(axis="z") > 0).sum() == np.isfinite(reduced["mean"].sel(axis="z")).sum() == 20
+    baseline, records = nulls(reduced, 40)
+    (claim,) = name_effects(reduced, baseline, records).claims
+    assert (claim.effect, claim.axes) == ("held_samples", ("x", "y", "z"))
 
 
 @pytest.mark.parametrize("fill", ["repeat", "zero"])

@@ -168,10 +168,11 @@ class LoggerFilter(Effect):
 class RateQuantization(Effect):
     """The rate is rounded to a lattice of values.
 
-    ``out = q round(w / q)``, or with ``mode = "floor"`` the value below.
+    ``out = q round(w / q)``, or with ``mode = "floor"`` the value below, with ``"zero"`` the one on the side of zero.
 
     *DAVAR*: ``q^2 / (12 k)`` more at k samples, white like N, where the noise of a sample is above q / 2; where it is smaller, steps
-    and dead bands: nothing at all, or too much. *Window mean*: -q / 2 for "floor". *Spectrum*: flat. *Axes*: independent.
+    and dead bands: nothing at all, or too much. *Window mean*: -q / 2 for "floor", and for "zero" q / 2 towards
+    zero, where the value 0 stands for two steps. *Spectrum*: flat. *Axes*: independent.
 
     Confused with N (the same, but for the lattice) and Q, the rounding of an angle that is carried on, with slope -1: look at the
     differences of values, which are multiples of q.
@@ -194,17 +195,22 @@ class RateQuantization(Effect):
     references: ClassVar[tuple[str, ...]] = ("Widrow and Kollar 2008, Quantization Noise",)
 
     step: float = parameter("deg/h", "distance between the values", typical=1.0, low=0.0, high=1e9)
-    mode: str = parameter("text", "to the nearest value, or the one below", default="round", choices=("round", "floor"))
+    mode: str = parameter(
+        "text", "to the nearest value, to the one below, or towards zero", default="round", choices=("round", "floor", "zero")
+    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """The signal on the lattice [degree hour-1]."""
         if self.step == 0.0:
             return chunk.signal, state
         count = chunk.signal / self.step
-        return self.step * (np.rint(count) if self.mode == "round" else np.floor(count)), state
+        return self.step * {"round": np.rint, "floor": np.floor, "zero": np.trunc}[self.mode](count), state
 
     def explain(self, windows: Windows) -> Prediction:
-        """White noise of step^2 / 12 in every sample; half a step less on average where the value below is taken."""
+        """White noise of step^2 / 12 in every sample; half a step less on average where the value below is taken.
+
+        Cut off towards zero the rate loses half a step as well, with its sign: a constant, as long as it keeps that.
+        """
         white = np.full((windows.begin.size, windows.frequency.size), 1.0 / (12.0 * windows.rate))
         mean = {"step": np.full(windows.begin.size, -0.5)} if self.mode == "floor" else {}
         return Prediction(mean=mean, spectrum={"step": white}, marks=("lattice",))

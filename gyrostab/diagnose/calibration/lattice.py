@@ -5,6 +5,7 @@ white. Differences of an angle that is rounded to steps s dt have errors that th
 Q = s dt / sqrt(12) of the noise, which raises the power at the highest frequency by s^2 / 3 over the variance of a sample, and which the
 baseline holds. So a rounded rate is claimed where the spectrum rules out the Q that the lattice would make if it were one of angles. From n
 samples Q^2 is known to about 1 / sqrt(n) of the variance of a sample: with 10^5 of them, a step of half their scatter can be told.
+A lattice whose cell of zero is two steps wide is one of rates that are cut off towards zero, however fine it is: angles know no zero.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.calibration.posterior import fit_squares, summed
+from gyrostab.diagnose.reduction.zero_cell import cut_off
 from gyrostab.noise import HOUR, URAD_PER_S
 
 __all__ = ["angle_share", "rounded_rates"]
@@ -27,7 +29,7 @@ _TERMS = 40
 
 
 def rounded_rates(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
-    """Axes whose values stand on a lattice because the rate was rounded, as far as the spectrum can tell.
+    """Axes whose values stand on a lattice because the rate was rounded, as far as the spectrum and the cell of zero can tell.
 
     Parameters
     ----------
@@ -43,6 +45,11 @@ def rounded_rates(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_
     step = reduced["lattice"].values
     if not (step > 0.0).any():
         return np.zeros(step.shape, np.bool_)
+    return np.asarray(cut_off(reduced) | _by_spectrum(reduced, baseline, step))
+
+
+def _by_spectrum(reduced: xr.Dataset, baseline: xr.Dataset, step: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Axes of which the spectrum rules out the Q that their lattice would make if it were one of angles."""
     if baseline.attrs.get("source") != "calibrated":
         from gyrostab.diagnose.calibration.baseline import calibrate
 

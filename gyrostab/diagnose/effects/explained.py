@@ -47,7 +47,8 @@ Array = NDArray[np.float64]
 FLOOR = 0.2
 _LINE_REACH = 3  # lines on each side of one that belong to it
 _FEW = 0.5  # of the blocks at most may be masked
-_ODD = 0.75  # of them may be left out for odd samples
+_ODD = 0.75  # of those that the axis has may be left out for odd samples
+_THERE = 0.1  # of the samples of the fullest block, above which an axis has a block
 _FLAT = 0.04  # of a density, by which its bands may differ where it is white
 _HOPS = 0.05  # share of a piece, by which a course that hops within a block differs in it
 _TURN = 0.2  # change of the logarithm of the noise power from block to block
@@ -317,10 +318,14 @@ def _everywhere(part: Part) -> bool:
 
 def odd_blocks(part: Part, reduced: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks with odd samples, which are left out on the axis; none where they would be too many, or the effect is in all alike."""
-    count = reduced[part.variant.columns[0]].sel(axis=part.row[0]).values if not _everywhere(part) else np.zeros(reduced.sizes["block"])
-    usual = 0.0 if part.variant.columns[0] == "outliers" else np.median(count)  # noise has as good as none
+    samples = reduced["samples"].sel(axis=part.row[0]).values
+    there = samples > _THERE * samples.max(initial=0)
+    if _everywhere(part) or not there.any():
+        return np.zeros(there.size, np.bool_)
+    count = reduced[part.variant.columns[0]].sel(axis=part.row[0]).values
+    usual = 0.0 if part.variant.columns[0] == "outliers" else float(np.median(count[there]))  # noise has as good as none
     odd = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
-    return np.asarray(odd & (odd.mean() <= _ODD))
+    return np.asarray(odd & (odd[there].mean() <= _ODD))
 
 
 def without_odd(reduced: xr.Dataset, parts: Iterable[Part]) -> xr.Dataset:

@@ -62,7 +62,10 @@ class Found:
 
 @dataclass(frozen=True)
 class Tallies:
-    """What null records say of counts: (mean, spread) by name; of a block. And the axes whose rate was rounded to a lattice."""
+    """What null records say of counts: mean (axis, block) and spread (axis,) by name; of the kurtosis of a block both (axis,).
+
+    And the axes whose rate was rounded to a lattice.
+    """
 
     of: dict[str, tuple[Array, Array]]
     rounded: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))

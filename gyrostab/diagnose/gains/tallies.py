@@ -106,11 +106,18 @@ class Expected:
 
 
 def expected_counts(values: Array) -> tuple[Array, Array]:
-    """Mean of a block's count and overdispersion of the record's, both (axis,), from null records (record, axis, block)."""
+    """Mean count of every block (axis, block), and overdispersion of the record's (axis,), from null records (record, axis, block).
+
+    Blocks of few samples, and those far from a value that is counted, have few. One record in which all blocks have the same is added,
+    so that none is expected to have nothing at all.
+    """
+    records, _, blocks = values.shape
     total = values.sum(axis=2)
-    mean = np.maximum(total.mean(axis=0), 1.0 / len(total))
+    mean = np.maximum(total.mean(axis=0), 1.0 / records)
     spread = np.maximum(total.var(axis=0) / mean, 1.0)
-    return mean / values.shape[2], spread
+    even = np.broadcast_to(mean[:, None] / blocks, values.shape[1:])
+    own = np.where(total.any(axis=0)[:, None], values.mean(axis=0), even)
+    return (records * own + even) / (records + 1.0), spread
 
 
 def _log_ratio(count: Array, mean: Array) -> Array:
@@ -135,7 +142,7 @@ def count_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.b
     Parameters
     ----------
     values : ndarray, shape (record, axis, block)
-    mean, spread : ndarray, shape (axis,)
+    mean, spread : ndarray, shapes (axis, block) and (axis,)
         From `expected_counts`.
     subsets : ndarray of bool, shape (subset, block)
         From `fold_subsets`.
@@ -147,7 +154,7 @@ def count_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.b
     found = []
     for subset in subsets:
         count = values[:, :, subset].sum(axis=2) / spread
-        found.append(_log_ratio(count, mean * subset.sum() / spread))
+        found.append(_log_ratio(count, mean[:, subset].sum(axis=1) / spread))
     return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
 
 

@@ -22,6 +22,7 @@ from gyrostab.diagnose.naming.filters import filter_sizes
 from gyrostab.diagnose.naming.name import Claim, Naming, Unknown
 from gyrostab.diagnose.naming.odd import line_size, mark_sizes
 from gyrostab.diagnose.naming.plainer import plainer
+from gyrostab.diagnose.reduction.zero_cell import cut_off
 from gyrostab.errors import GyrostabError
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
@@ -215,6 +216,8 @@ def _words(claim: Claim, part: Part, state: State) -> dict[str, Any]:
         return {"phase": "channel", "full": float(part.variant.values.get("full", 1.0)) * (high - low)}
     if claim.effect == "held_samples":
         return {"fill": "zero" if part.variant.columns[0] == "filled" else "repeat"}
+    if claim.effect == "rate_quantization" and cut_off(state.reduced)[state.axes.index(part.row[0])]:
+        return {"mode": "zero"}
     if claim.effect == "spikes":
         return {"kind": "outlier"}
     if claim.effect == "earth_rate" and mirrored(part):

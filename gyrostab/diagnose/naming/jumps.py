@@ -26,7 +26,7 @@ def jumps_at_will(part: Part, state: State) -> bool:
     return not np.isclose(ends, float(part.variant.values[_INSTANT])).any()
 
 
-def sudden(parts: Sequence[Part], state: State) -> bool:
+def sudden(parts: Sequence[Part], state: State, *, error: float = 0.0) -> bool:
     """Whether jumps step, rather than go over from one level to the other within some blocks.
 
     Where a straight way of four or eight blocks about the same instant says more on all axes together, something else came and went.
@@ -37,13 +37,15 @@ def sudden(parts: Sequence[Part], state: State) -> bool:
         Of an effect.
     state : State
         With all else that is named.
+    error : float
+        What errors of the form of that may leave [nats].
     """
     jumps = [part for part in parts if jumps_at_will(part, state)]
     if not jumps:
         return True
     step = sum(_evidence(part, state, 0) for part in jumps)
     over = max(sum(_evidence(part, state, length) for part in jumps) for length in _BLOCKS)
-    return over - step <= _BETTER + _FORM * sum(max(part.gain, 0.0) for part in jumps)
+    return over - step <= _BETTER + error + _FORM * sum(max(part.gain, 0.0) for part in jumps)
 
 
 def _evidence(part: Part, state: State, length: int) -> float:

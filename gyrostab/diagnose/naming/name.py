@@ -22,7 +22,7 @@ from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown, form_error, 
 from gyrostab.diagnose.naming.complete import flexible, redness, unrest
 from gyrostab.diagnose.naming.expected_claims import expected_claims
 from gyrostab.diagnose.naming.filters import without_slopes
-from gyrostab.diagnose.naming.hopping import followed_first, hopping, renewed
+from gyrostab.diagnose.naming.hopping import followed_first, hopping, hops_alone, renewed
 from gyrostab.diagnose.naming.layers import found_again, layers
 from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, lines_only, parts_of, tried_again, without_lines
 from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural, without_pulses
@@ -176,6 +176,7 @@ class _Search:
                 chosen = with_claim(chosen, one)
                 barred |= self._counted(one)
                 state = explain_away(state, list(one.parts))
+        chosen = hops_alone(chosen, lambda some: self._with(start, some), self._of, self.threshold)
         chosen = self._pruned(start, without_pulses(chosen))
         chosen, claims = self._settled(start, chosen)
         unknown = [one for one in chosen if isinstance(one, Unknown)]
@@ -220,16 +221,16 @@ class _Search:
         parts = without_lines(by_key(found))
         need = {key: self.threshold + form_error(several, [*self.expected, *chosen], share=FORM) for key, several in parts.items()}
         for key in [key for key in parts if not key.startswith("~") and gain_sum(parts[key]) > need[key]]:
-            parts[key] = possible(parts[key], state)
+            parts[key] = possible(parts[key], state, error=need[key] - self.threshold)
         ranked = sorted(parts, key=lambda key: -gain_sum(parts[key]))
         passing = [key for key in ranked if gain_sum(parts[key]) > need[key]]
         odd = [key for key in passing if parts[key][0].candidate.view == "marks" and not key.startswith("~")]
         shared = [key for key in passing if gain_sum(_witnessed(parts[key], state)) > need[key]]
         # odd samples first: they raise powers and means too, and not the other way round; then motion that another sensor sees as well
-        hops = hopping(passing, parts)  # what hops within blocks has a spectrum, tails and a level of the noise that changes
+        hops = hopping(passing, parts, state)  # what hops within blocks has a spectrum, tails and a level of the noise that changes
         odd = [] if hops and passing.index(hops[0]) < min(map(passing.index, odd), default=0) else odd
         passing = odd or shared or hops or without_slopes(self._without_locked_lines(passing, parts, state), parts, state, self.folds)
-        passing = followed_first(passing, parts)
+        passing = followed_first(passing, parts, state)
         if not passing:
             return None
         top = gain_sum(parts[passing[0]])

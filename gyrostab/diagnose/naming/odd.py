@@ -50,7 +50,7 @@ def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: 
     if mark == "lattice":
         return {"step": (float(reduced["lattice"].sel(axis=axis)), 0.0)}
     row = [str(one) for one in reduced["axis"].values].index(axis)
-    usual = float(tallies.of[mark][0][row]) * reduced.sizes["block"] if mark in tallies.of else 0.0
+    usual = float(tallies.of[mark][0][row].sum()) if mark in tallies.of else 0.0
     count = max(float(reduced[mark].sel(axis=axis).sum()) - usual, 1.0)
     spread = _spread(reduced, axis)
     error = math.sqrt(count + usual)

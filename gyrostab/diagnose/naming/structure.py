@@ -18,6 +18,7 @@ from gyrostab.diagnose.naming.filters import on_all_axes
 from gyrostab.diagnose.naming.jumps import sudden
 from gyrostab.diagnose.naming.steady import always_there
 from gyrostab.diagnose.reduction.reduced import measured
+from gyrostab.diagnose.reduction.zero_cell import may_be_cut_off
 from gyrostab.physics.registry import effects
 
 __all__ = ["PLAINER", "STRUCTURAL", "plainer_effect", "possible", "structural", "without_pulses"]
@@ -57,9 +58,12 @@ def without_pulses(chosen: Sequence[Claim | Unknown]) -> list[Claim | Unknown]:
     return out
 
 
-def possible(parts: Sequence[Part], state: State) -> list[Part]:
-    """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not."""
-    return [part for part in parts if _possible(part, state)] if on_all_axes(parts, state) and sudden(parts, state) else []
+def possible(parts: Sequence[Part], state: State, *, error: float = 0.0) -> list[Part]:
+    """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not.
+
+    `error` is what errors of the form of all else that is named may leave to the effect [nats].
+    """
+    return [part for part in parts if _possible(part, state)] if on_all_axes(parts, state) and sudden(parts, state, error=error) else []
 
 
 def plainer_effect(parts: Sequence[Part], state: State) -> str | None:
@@ -141,6 +145,8 @@ def structural(effect: str, parts: Sequence[Part], state: State, *, lines: int =
         out.append("feedback_reset")
     if effect == "dead_zone" and len(state.axes) == 1:  # no other axis says whether the sample was lost
         out.append("held_samples")
+    if effect == "dead_zone" and any(may_be_cut_off(reduced)[state.axes.index(part.row[0])] for part in parts):
+        out.append("rate_quantization")  # cut off towards zero, its cell of zero is twice as wide
     if effect == "telegraph" and not any(part.candidate.view == "levels" for part in parts):
         out.append("gauss_markov")  # two levels show in the means only
     if effect == "vibration_rectification":

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.reduction.outliers import Peaks, find_peaks, zeros_together
+from gyrostab.diagnose.reduction.outliers import Peaks, find_peaks, samples_at_once, zeros_together
 from gyrostab.diagnose.reduction.stretches import Stretch, channel_at, numeric_channels
 from gyrostab.errors import UnitError
 from gyrostab.kernels import periodogram as kernel
@@ -30,7 +30,7 @@ FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
 PIECES = 16
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
 _GAP_S = 1.0  # shorter gaps are not listed
-_FOR_LATTICE = 64  # blocks whose values are kept
+_FOR_LATTICE, _KEPT = 64, 2**16  # blocks whose values are kept; of each axis, about
 
 
 class Accumulator:
@@ -54,6 +54,7 @@ class Accumulator:
         self.moments = np.full((rows, blocks, 5), np.nan)
         self.counts = np.zeros((rows, blocks, 9), np.int64)
         self.together = np.zeros((self.axes, blocks), np.int64)
+        self.at_once: dict[tuple[bool, ...], NDArray[np.int64]] = {(True,) * self.axes: np.zeros(blocks, np.int64)}
         self.histogram = np.zeros((self.axes, blocks, HISTOGRAM), np.uint32)
         self.peaks: list[list[Peaks]] = [[] for _ in range(self.axes)]
         self.power = np.full((rows, blocks, bands), np.nan)
@@ -97,6 +98,8 @@ class Accumulator:
                 self.peaks[row].append(found._replace(block=found.block + stretch.first))
         self._spectra(part, centred, present)
         self.together[:, part] = zeros_together(stretch.values[: self.axes])
+        for kind, number in samples_at_once(present[: self.axes]).items():
+            self.at_once.setdefault(kind, np.zeros(self.blocks, np.int64))[part] = number
         self.adjacent[:, part] = np.count_nonzero(present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1)
         self._find_gaps(part, present[: self.axes])
         inner = np.arange(PIECES) * self.length // PIECES
@@ -110,7 +113,7 @@ class Accumulator:
                 fine[part] = total / np.add.reduceat(present[row].astype(np.float64), edges, axis=1)
         every = max(1, self.blocks // _FOR_LATTICE)
         chosen = [number for number in range(part.start, part.stop) if number % every == 0]
-        self.kept += [stretch.values[: self.axes, number - part.start, : 2**14 // _FOR_LATTICE].copy() for number in chosen]
+        self.kept += [stretch.values[: self.axes, number - part.start, : _KEPT // _FOR_LATTICE].copy() for number in chosen]
         if self.order is not None:
             self._orders(part, centred[: self.axes])
         if self.profile_sums is not None:

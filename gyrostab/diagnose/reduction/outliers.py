@@ -10,7 +10,18 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
-__all__ = ["CHANCE", "Peaks", "beyond_chance", "count_outliers", "find_peaks", "lattice_step", "outlier_limit", "zeros_together"]
+__all__ = [
+    "CHANCE",
+    "Peaks",
+    "beyond_chance",
+    "chance_of_all",
+    "count_outliers",
+    "find_peaks",
+    "lattice_step",
+    "outlier_limit",
+    "samples_at_once",
+    "zeros_together",
+]
 
 Array = NDArray[np.float64]
 #: Outliers that a record of Gaussian noise has on average, by axis.
@@ -194,12 +205,48 @@ def zeros_together(values: Array) -> NDArray[np.int64]:
     return np.asarray(found.sum(axis=-1))
 
 
-def beyond_chance(together: NDArray[Any], zeros: NDArray[Any], samples: NDArray[Any]) -> NDArray[np.int64]:
+def samples_at_once(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArray[np.int64]]:
+    """How many samples of each block two axes or more have at once, by which axes these are.
+
+    Parameters
+    ----------
+    present : ndarray of bool, shape (axis, block, sample)
+
+    Returns
+    -------
+    dict of tuple of bool to ndarray of int64, shape (block,)
+        The axes that have a sample, and no other one -> number of instants.
+
+    Examples
+    --------
+    >>> samples_at_once(np.array([[[True, True, True]], [[True, False, True]], [[True, True, False]]]))
+    {(True, False, True): array([1]), (True, True, False): array([1]), (True, True, True): array([1])}
+    """
+    axes, blocks = present.shape[:2]
+    if axes < 2:
+        return {}
+    if (present == present[:1]).all():
+        return {(True,) * axes: np.asarray(np.count_nonzero(present[0], axis=-1), np.int64)}
+    code = (present * (1 << np.arange(axes, dtype=np.int64))[:, None, None]).sum(axis=0)
+    kinds, place = np.unique(code, return_inverse=True)
+    each = np.arange(blocks)[:, None] * kinds.size + place.reshape(code.shape)
+    number = np.bincount(each.ravel(), minlength=blocks * kinds.size).reshape(blocks, kinds.size)
+    found = {tuple(bool(kind >> axis & 1) for axis in range(axes)): number[:, k] for k, kind in enumerate(kinds.tolist())}
+    return {kind: found[kind] for kind in sorted(found) if sum(kind) > 1}
+
+
+def beyond_chance(
+    together: NDArray[Any], zeros: NDArray[Any], samples: NDArray[Any], subset: NDArray[np.bool_], at_once: NDArray[Any]
+) -> NDArray[np.int64]:
     """Zeros of `zeros_together` less those that independent zeros of the axes, or of a single axis, would bring together.
 
     Parameters
     ----------
     together, zeros, samples : ndarray of int, shape (..., axis, block)
+    subset : ndarray of bool, shape (subset, axis)
+        Which axes have samples at once; nothing is asked of it where there is a single axis.
+    at_once : ndarray of int, shape (subset, block)
+        Number of samples that these axes have at once, and no other one.
 
     Returns
     -------
@@ -207,7 +254,8 @@ def beyond_chance(together: NDArray[Any], zeros: NDArray[Any], samples: NDArray[
 
     Examples
     --------
-    >>> beyond_chance(np.array([[30], [30]]), np.array([[40], [50]]), np.array([[100], [100]]))
+    >>> both = np.array([[True, True]])
+    >>> beyond_chance(np.array([[30], [30]]), np.array([[40], [50]]), np.array([[100], [100]]), both, np.array([[100]]))
     array([[10],
            [10]])
     """
@@ -215,8 +263,14 @@ def beyond_chance(together: NDArray[Any], zeros: NDArray[Any], samples: NDArray[
     if zeros.shape[-2] == 1:
         chance = zeros * (1.0 - (1.0 - share) ** 2)
     else:
-        chance = np.max(samples, axis=-2, keepdims=True) * np.prod(share, axis=-2, keepdims=True)
+        all_zero = chance_of_all(share, subset)
+        chance = np.moveaxis(np.tensordot(subset.T.astype(np.float64), all_zero * at_once, axes=(1, -2)), 0, -2)
     return np.asarray(np.maximum(together - np.rint(chance), 0), np.int64)
+
+
+def chance_of_all(share: Array, subset: NDArray[np.bool_]) -> Array:
+    """Chance that all axes of each subset are zero at once, (..., subset, block), from the shares (..., axis, block) of zeros."""
+    return np.asarray(np.stack([np.prod(share[..., np.flatnonzero(one), :], axis=-2) for one in subset], axis=-2))
 
 
 def lattice_step(values: Array) -> float:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.reduction.accumulate import FINE, FOLLOWED, HARMONICS, PARTS, PHASES, Accumulator
 from gyrostab.diagnose.reduction.outliers import beyond_chance, count_outliers, lattice_step
 from gyrostab.diagnose.reduction.stretches import channel_means, numeric_channels, read_stretches, row_count, sample_count
+from gyrostab.diagnose.reduction.zero_cell import CELLS, cell_widths
 from gyrostab.errors import OptionError
 from gyrostab.kernels.smooth import smooth_curve
 from gyrostab.progress import Stage, no_stage
@@ -24,6 +25,7 @@ __all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "reduce_
 Array = NDArray[np.float64]
 _BLOCK_S, _FEWEST, _MOST, _LEAST_SAMPLES, _MUST = 20.0, 90, 6000, 100, 24
 _SMOOTH = 2.0  # blocks over which the course of a channel is smoothed at most
+_FOR_STEP = 256  # values of a block that tell the step of the lattice
 _MEAN_SHARE = 0.1  # of a block that must be present for its mean
 _POWER = "degree2 hour-2 Hz-1"
 _RATE = INNER["rate"]
@@ -112,6 +114,7 @@ def reduce_log(
         ``cross_shape`` (pair, block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
         ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
         ``profile(axis, block, phase)``, ``piece_mean`` and ``piece_samples`` (axis, block, inner), ``lattice(axis)``,
+        ``cell_width(axis, cell)`` [steps of the lattice], ``axes_at_once(subset, axis)``, ``at_once(subset, block)``,
         ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects follow late, and the gaps and restarts in seconds.
         Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
@@ -163,8 +166,10 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
     with np.errstate(invalid="ignore", divide="ignore"):
         kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
     peaks, outliers = count_outliers(work.histogram, work.peaks)
-    filled = beyond_chance(work.together, counts[..., 1], present)
-    lattice = np.array([lattice_step(np.concatenate([kept[row].ravel() for kept in work.kept])) for row in range(work.axes)])
+    subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
+    filled = beyond_chance(work.together, counts[..., 1], present, subset, at_once)
+    lattice = np.array([lattice_step(_kept(work, row, _FOR_STEP)) for row in range(work.axes)])
+    cells = np.array([cell_widths(_kept(work, row), step) for row, step in enumerate(lattice)])
     weight = np.divide(work.line_counts[..., 0] ** 2, work.line_counts[..., 1], where=work.line_counts[..., 1] > 0,
                        out=np.zeros(work.line_counts.shape[:2]))  # fmt: skip
     weight *= _evenness(work.power[axes], work.shape, present, weight.shape[1])
@@ -188,12 +193,27 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
         "zeros": (plane, counts[..., 1], _named("samples that are exactly 0", "1")),
         "stuck": (plane, _stuck(moments, counts, filled), _named("zeros of one axis, within its range", "1")),
         "filled": (plane, filled, _named("zeros of all axes at once; of a single axis in runs", "1")),
+        "axes_at_once": (("subset", "axis"), subset, _named("axes that have samples at once", "1")),
+        "at_once": (("subset", "block"), at_once, _named("samples that these axes have at once, and no other one", "1")),
         "lattice": ("axis", lattice, _named("step of the lattice of values, 0 for none", _RATE)),
         "line_power": (("axis", "part", "line"), lines, _named("mean periodogram at full resolution, two-sided density", _POWER)),
         "line_weight": (("axis", "part"), weight, _named("blocks in each mean, as many as equal ones would do", "1")),
     }
+    variables |= {
+        "cell_width": (
+            ("axis", "cell"),
+            cells[:, 0],
+            _named("width of the cell of 0 and of those beside it, in steps of the lattice", "1"),
+        ),
+        "cell_width_stderr": (("axis", "cell"), cells[:, 1], _named("standard error of it", "1")),
+    }
     variables |= _inner(work) | _beside(work, log) | _locked(work) | _channels(work, log) | _fine(work, log) | _spans(work, log, restart)
     return xr.Dataset(variables, coords=_coordinates(work, log), attrs=_attributes(work, log, present)).set_coords(["first", "second"])
+
+
+def _kept(work: Accumulator, row: int, most: int | None = None) -> Array:
+    """Values of an axis that were kept, so many of each block at most."""
+    return np.concatenate([kept[row][:most] for kept in work.kept])
 
 
 def _inner(work: Accumulator) -> dict[str, Any]:
@@ -365,6 +385,7 @@ def _coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     stamps = grid_times(work.start, work.rate, ends)
     step = work.rate / work.length
     coordinates: dict[str, Any] = {
+        "cell": ("cell", np.array(CELLS, dtype=object)),
         "axis": ("axis", np.array([str(name) for name in log["axis"].values], dtype=object)),
         "time": ("block", (stamps[:-1] + np.diff(stamps) // 2).view("datetime64[ns]"), {"long_name": "middle of the block"}),
         "begin": ("block", ends[:-1] / work.rate, _named("start of the block, since the start", "s")),
