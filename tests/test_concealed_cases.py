@@ -79,6 +79,16 @@ def test_true_numbers_of_a_slow_supply_leave_next_to_nothing_of_it():
             assert np.var(seen - size * followed) < 0.05 * np.var(seen)
 
 
+def test_latitude_is_that_of_the_rate_across_the_tool_wherever_it_rests():
+    world = draw_world(np.random.default_rng(3), rate=10.0, seconds=900.0)
+    turning = np.arange(world.rotation.size) * 0.1 < 300.0  # at rest for longer, at some angle
+    world = replace(world, rotation=np.where(turning, 60.0, 0.0))
+    for seed in range(4):
+        effect = CATALOGUE["earth_rate"].make(world, stream(seed, "rest"), strength=4.0)
+        across = np.median(np.hypot(effect.mean[0], effect.mean[1]))
+        assert math.cos(math.radians(effect.parameters["latitude"]["value"])) * 15.041 == pytest.approx(across, rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("name", "term"), [("temperature_bias", "quadratic"), ("vibration_rectification", "quartic"), ("scale_factor", "cubic")]
 )

@@ -185,6 +185,20 @@ def test_size_of_a_line():
     assert frequency == pytest.approx(2.345, abs=0.03)
 
 
+def test_where_a_line_is_is_known_to_a_step_of_its_spectrum():
+    true = 4.013
+    reduced = record([{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}])
+    baseline = calibrate(reduced)
+    naming = claimed(reduced, baseline, "spectral_line", "line", ("amplitude",))
+    place = int(reduced["line_power"].sel(axis="x").mean("part").values.argmax())
+    part = replace(naming.claims[0].parts[0], place=place)
+    (fitted,) = fit_claims(replace(naming, claims=(replace(naming.claims[0], parts=(part,)),)), baseline)
+    found = fitted.parameters["frequency"]
+    step = float(np.diff(reduced["line_frequency"].values[:2])[0])
+    assert found.low < true < found.high
+    assert found.high - found.low < 2.0 * step
+
+
 def test_simulation_of_named_effects_runs(shaken):
     naming, baseline = shaken
     (fitted,) = fit_claims(naming, baseline)

@@ -53,6 +53,25 @@ def test_earth_rate_is_taken_out_and_made_again(around):
     assert float(np.abs(again["rate"] - log["rate"]).max()) < 0.01 * float(log["rate"].std())
 
 
+@pytest.mark.parametrize(("latitude", "most"), [(60.0, 4.5), (89.8, 0.3)])
+def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most):
+    """Of 4 % of the earth's rate across the tool, not of the angle itself, which depends on where it is counted from."""
+    log = _log({"name": "earth_rate", "latitude": latitude, "toolface": 150.0, "off": [90.0, 90.0], "around": [0.0, 90.0]})
+    reduced = reduce_log(log)
+    baseline = calibrate(reduced)
+    known, reasons = effect_candidates(reduced, baseline["coefficient"])
+    start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
+    parts = by_key(gains([one for one in known if one.view == "order"], reduced, start, folds))["earth_rate(rotation_rate)"]
+    claim = Claim("earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0)
+    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), explain_away(start, parts), folds)
+    found = fit_claims(naming, baseline)[0].parameters
+    assert found["latitude"].low < latitude < found["latitude"].high
+    by_size = np.degrees(1.96 * 0.04 / np.tan(np.radians(latitude)))
+    assert 0.9 * by_size < (found["latitude"].high - found["latitude"].low) / 2.0 < most
+    assert np.degrees(0.04) - 1e-9 < found["toolface"].stderr < 7.0
+    assert found["toolface"].low < 150.0 < found["toolface"].high
+
+
 def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
     """The second line is the strongest, the third a half of it; x has them all, y the first alone."""
     points = ((0, 108.0), (600, 108.0), (610, 66.0), (1200, 66.0))

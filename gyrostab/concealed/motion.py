@@ -165,7 +165,8 @@ def earth_rate(world: World, rng: np.random.Generator, *, strength: float) -> Ef
         differs=False,
         tau=_turn_tau(world),
     )
-    across = float(effect.parameters["peak"]["value"])  # the earth's rate across the tool, of 15.041 deg/h at most
+    assert effect.mean is not None
+    across = float(np.hypot(effect.mean[0], effect.mean[1]).max())  # the earth's rate across the tool, of 15.041 deg/h at most
     if across < tool.EARTH_RATE:
         effect.parameters["latitude"] = {"value": math.degrees(math.acos(across / tool.EARTH_RATE)), "unit": "deg"}
     return effect

@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 #: Error of the form of an effect, as a share of its size: no effect is exactly what its equation says.
 FORM_ERROR = 0.04
 _TWO_SIDED = 1.959964
+_ANGLE = "deg"
+_PLACE = "line", "frequency"  # where a line is has nothing to do with what makes it
+_EARTH = 15.041067  # deg/h
 
 
 @dataclass(frozen=True)
@@ -167,7 +170,8 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
     for name, (mean, sd, *ends) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
         if math.isfinite(mean) and not math.isnan(sd):  # a low-pass of infinite bandwidth is none; an exponent may be told, not measured
-            estimates[name] = _estimate(mean, sd, unit, ends=ends, positive=_positive(kind, name))
+            form = 0.0 if unit == _ANGLE or (view, name) == _PLACE else FORM_ERROR * mean  # angles have that of the size already
+            estimates[name] = _estimate(mean, sd, unit, ends=ends, positive=_positive(kind, name), form=form)
         _put(values, name, mean, axes)
     values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
     values |= _words(claim, by_view[view][0], state)
@@ -243,11 +247,10 @@ def _within(value: Any, low: float, high: float) -> Any:
     return min(max(float(value), low), high)
 
 
-def _estimate(mean: float, sd: float, unit: str, *, positive: bool, ends: Sequence[float] = ()) -> Estimate:
-    """With the error of the form in it; `ends` are those of the 95 % interval without it, where that is not symmetric."""
+def _estimate(mean: float, sd: float, unit: str, *, positive: bool, form: float, ends: Sequence[float] = ()) -> Estimate:
+    """With the error of the `form` in it; `ends` are those of the 95 % interval without it, where that is not symmetric."""
     if sd <= 0.0:  # what is counted, not measured, is exact
         return Estimate(mean, 0.0, mean, mean, unit)
-    form = FORM_ERROR * mean
     low, high = ends or (mean - _TWO_SIDED * sd, mean + _TWO_SIDED * sd)
     low, high = mean - math.hypot(mean - low, _TWO_SIDED * form), mean + math.hypot(high - mean, _TWO_SIDED * form)
     return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
@@ -282,21 +285,31 @@ def _common(parts: list[Part], axes: tuple[str, ...], state: State, naming: Nami
     return shared_sizes(parts, axes, state)
 
 
-def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
-    """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down."""
-    out: dict[str, tuple[float, float]] = {}
+def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
+    """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down.
+
+    Angles have the error of the form that the amplitude has: a share of an angle would be none.
+    """
+    out: dict[str, tuple[float, ...]] = {}
     for part in parts:
         size, sd, angle = _amplitude(part, state)
-        turn = math.degrees(sd / max(size, 1e-300))
+        error = math.hypot(sd / max(size, 1e-300), FORM_ERROR)
         if not part.candidate.each:
             across = size * float(np.abs(part.variant.design).max())
-            latitude = math.degrees(math.acos(min(across / 15.041067, 1.0)))
-            slope = 15.041067 * max(math.sin(math.radians(latitude)), 0.05)
-            return {"latitude": (latitude, math.degrees(sd * across / max(size, 1e-300) / slope)), "toolface": (angle, turn)}
+            return {"latitude": _latitude(across, error * across), "toolface": (angle, math.degrees(error))}
         label = "" if len(axes) == 1 else f".{part.row[0]}"
-        out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, turn)}
+        out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
         out["order"] = (float(state.reduced["harmonic"].values[part.place % state.reduced.sizes["harmonic"]]), 0.0)
     return out
+
+
+def _latitude(across: float, error: float) -> tuple[float, float, float, float]:
+    """Latitude [deg], its standard error and the ends of its 95 % interval, by the earth's rate across a tool that points down [deg/h]."""
+    low, middle, high = (
+        math.degrees(math.acos(min(max(rate, 0.0) / _EARTH, 1.0)))
+        for rate in (across + _TWO_SIDED * error, across, across - _TWO_SIDED * error)
+    )
+    return middle, max((high - low) / (2.0 * _TWO_SIDED), 1e-12), low, high
 
 
 def _amplitude(part: Part, state: State) -> tuple[float, float, float]:
