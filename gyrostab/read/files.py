@@ -15,11 +15,12 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.join import join_logs, log_span
-from gyrostab.read.buffers import SPILL_BYTES, Spool
+from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
 from gyrostab.read.lost import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.overlap import stamp_span
+from gyrostab.read.pieces import Spool
 from gyrostab.schema import texts
 
 __all__ = ["OnFile", "Reader", "read_log", "readers", "scan_file"]
