@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import glob
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -26,6 +28,8 @@ from gyrostab.schema import texts
 __all__ = ["OnFile", "Reader", "read_log", "readers", "scan_file"]
 
 GROUP = "gyrostab.readers"
+#: Text files that are read side by side.
+_TOGETHER = 2
 
 #: Called with the number of a file, the number of files and the path.
 OnFile = Callable[[int, int, Path], None]
@@ -262,11 +266,9 @@ def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | Non
     lost: list[LostFile] = []
     spool = Spool()
     held = 0
-    for number, path in enumerate(paths, 1):
-        if on_file is not None:
-            on_file(number, len(paths), path)
+    for path, read in zip(paths, _ahead(paths, options, on_file), strict=True):
         try:
-            part = _read(path, options)
+            part = read()
         except (GyrostabError, OSError) as error:
             if options.strict or len(paths) == 1 or not is_damage(path, error):
                 raise
@@ -279,6 +281,30 @@ def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | Non
         parts[path] = part
     check_share(lost, len(paths))
     return parts, lost
+
+
+def _ahead(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None) -> Iterator[Callable[[], xr.Dataset]]:
+    """What reads each file; a text file is read already, while the one before it is looked at, as its beginning takes one thread."""
+    with ThreadPoolExecutor(_TOGETHER, thread_name_prefix="gyrostab-file") as pool:
+        waiting: deque[Callable[[], xr.Dataset]] = deque()
+        try:
+            for number, path in enumerate(paths, 1):
+                if on_file is not None:
+                    on_file(number, len(paths), path)
+                waiting.append(pool.submit(_read, path, options).result if _is_text(path) else partial(_read, path, options))
+                if len(waiting) == _TOGETHER:
+                    yield waiting.popleft()
+            while waiting:
+                yield waiting.popleft()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _is_text(path: Path) -> bool:
+    try:
+        return bool(_reader(path) is _registered()["text"].load())
+    except FormatError:
+        return False  # which reading will say
 
 
 def _spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:

@@ -116,7 +116,8 @@ class Intake:
         if size == 0:
             return Taken(0, {}, {}, _NO_ROWS, _NO_ROWS, 0, 0, np.iinfo(np.int64).max, NAT)
         bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
-        bad_cells, block, ranges, masks = words + int(np.count_nonzero(bad)), {}, {}, []
+        block: dict[int, NDArray[Any] | Piece] = {}
+        bad_cells, ranges, masks = words + int(np.count_nonzero(bad)), {}, []
         for column in [*self.gyro, *self.channels]:
             source = column.source
             block[source], ranges[source] = self._convert(column, values[source])

@@ -36,7 +36,7 @@ class Spool:
             with self._lock:
                 if self.file is None:
                     self.file = tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)  # noqa: SIM115
-                _write_all(self.file, memoryview(values).cast("B"))
+                _write_all(self.file, values.data.cast("B"))
                 begin, self.end = self.end, self.end + values.nbytes
                 return begin
         except OSError as error:
@@ -76,7 +76,7 @@ class _Place:
     def read(self, first: int, out: NDArray[Any]) -> None:
         """Its values from number `first` on."""
         wide, done = self.dtype.itemsize, 0
-        view = memoryview(out).cast("B")
+        view = out.data.cast("B")
         while done < view.nbytes:
             got = os.preadv(self.spool.handle, [view[done:]], self.begin + wide * first + done)
             if got < 1:
