@@ -119,7 +119,7 @@ class TestKernels:
         rng = np.random.default_rng(seed)
         x = rng.integers(-5, 6, n).astype(np.float64)
         x[rng.random(n) < missing] = np.nan
-        starts, stops = present_runs(x)
+        starts, stops = present_runs(x, x.size, np.full(1, -1.0))
         edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
         np.testing.assert_array_equal(starts, edges[::2])
         np.testing.assert_array_equal(stops, edges[1::2])

@@ -31,8 +31,8 @@ __all__ = ["davar", "davar_part", "davar_parts"]
 
 #: Samples of a part up to which all its axes are read together.
 _TOGETHER = 2**21
-#: Parts at least of a surface of so many units of work, for the threads to share.
-_LEAST_PARTS = 4
+#: A part gets this share at most of the units of work that are left: threads that share the parts then end at about the same time.
+_SHARE = 1 / 4
 
 
 def davar(
@@ -131,7 +131,7 @@ def davar(
 
 
 def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> list[slice]:
-    """Cut the windows of a surface into parts that `davar_part` computes, each of whole units of work.
+    """Cut the windows of a surface into parts that `davar_part` computes, each of whole units of work, the last ones smaller.
 
     Parameters
     ----------
@@ -158,8 +158,10 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     units = units_of_work(size, plan.unit)
     per_unit = max(1, units[0].stop - units[0].start)
     cells = axes * plan.unit.ks.size
-    together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit), -(-len(units) // _LEAST_PARTS)))
-    edges = [number * len(units) // count for count in [-(-len(units) // together)] for number in range(count + 1)]
+    together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit)))
+    edges = [0]
+    while left := len(units) - edges[-1]:
+        edges.append(edges[-1] + max(1, min(together, int(left * _SHARE))))
     return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
 
 
