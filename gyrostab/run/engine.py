@@ -122,9 +122,13 @@ def write_blocks(blocks: Blocks, target: Path, *, attrs: Mapping[str, Any], over
             return results
         return dask.local.get_sync(dask.optimization.cull(tasks, [keys])[0], keys)
 
+    def share(written: float) -> None:
+        if variables:
+            stage("writing", variables, max(min(done, variables), int(written * variables)), "variables")
+
     stage("writing", variables, 0, "variables")
     with dask.config.set(scheduler=in_order):
-        to_netcdf(whole, target, overwrite=overwrite)
+        to_netcdf(whole, target, overwrite=overwrite, progress=share)
     return whole
 
 
