@@ -187,7 +187,7 @@ def _part(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
     begin = block.begin + described["place"]
-    return mapped[begin : begin + int(np.prod(shape)) * dtype.itemsize].view(dtype).reshape(shape)
+    return np.asarray(mapped[begin : begin + int(np.prod(shape)) * dtype.itemsize].view(dtype).reshape(shape))
 
 
 def _section(block: Block, name: str) -> NDArray[Any]:
