@@ -147,7 +147,15 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
 def blocks(
     raw: xr.Dataset, found: Survey, *, block: int = BLOCK, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Row numbers and stamps [ns, `NO_STAMP` where unreadable] of the rows that hold a sample, block by block."""
+    """Row numbers and stamps [ns, `NO_STAMP` where unreadable] of the rows that hold a sample, block by block, fetched ahead."""
+    return in_order(_same, _blocks(raw, found, block, all_rows=all_rows), workers=1)
+
+
+def _same(block: tuple[NDArray[np.int64], NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return block
+
+
+def _blocks(raw: xr.Dataset, found: Survey, block: int, *, all_rows: bool) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     stamps = raw["time"].data
     for begin in range(0, found.rows, block):
         end = min(found.rows, begin + block)
