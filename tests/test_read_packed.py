@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ from hypothesis import strategies as st
 
 from gyrostab.kernels.decimals import decimals_of, even_steps, from_decimals, to_decimals, unroll_steps
 from gyrostab.kernels.stamps import NO_STAMP, new_state, place
-from gyrostab.read import buffers, files, read_log
+from gyrostab.read import buffers, files, read_log, text
 from gyrostab.read.combine import memory
 from gyrostab.read.pieces import Counts, Pieces, Spool, Steps, Words
 from gyrostab.threads import in_order
@@ -127,6 +129,28 @@ def test_a_log_that_is_packed_is_the_log(tmp_path, monkeypatch, limit, decimals)
     assert packed.rate.chunks is not None
     xr.testing.assert_identical(packed.compute(), plain)
     np.testing.assert_array_equal(bits(packed.rate.compute().values), bits(plain.rate.values))
+
+
+def test_reading_ahead_ends_with_what_stops_it(tmp_path, monkeypatch):
+    paths = [text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)]
+    taken: list[int] = []
+    take = text._take
+
+    def slowly(block, **options):
+        time.sleep(0.005)
+        taken.append(len(block))
+        return take(block, **options)
+
+    def refuse(number, count, path):
+        if number == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(text, "_take", slowly)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 256)
+    with pytest.raises(KeyboardInterrupt):
+        read_log(paths, on_file=refuse)
+    assert sum(taken) < paths[0].stat().st_size / 3
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("gyrostab-")]
 
 
 def test_whole_numbers_at_even_steps_take_less_than_half_the_room(tmp_path, monkeypatch):

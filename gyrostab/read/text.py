@@ -9,7 +9,8 @@ from __future__ import annotations
 import gzip
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from functools import partial
 from io import BufferedReader
 from pathlib import Path
@@ -67,13 +68,15 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return summary_of(plan, "text", rows, head=head, tail=tail, notes=layout.notes)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a text file; see `gyrostab.read.read_log`."""
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES, stop: Callable[[], bool] | None = None) -> xr.Dataset:
+    """The raw log of a text file; see `gyrostab.read.read_log`. Ends with `CancelledError` where `stop` comes to be true."""
     layout, plan = _look(path, options)
     intake = Intake(plan.check(), options, limit=limit)
     typing = Typing(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
     for parts in in_order(partial(_take, typing=typing, intake=intake), _blocks(path, layout.offset)):
+        if stop is not None and stop():
+            raise CancelledError
         for part in parts:
             intake.add(part.taken, partial(_line_names, part, line))
             line += part.lines
