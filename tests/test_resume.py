@@ -143,8 +143,7 @@ def test_parts_are_cuts_of_the_whole_bit_for_bit():
         xr.testing.assert_identical(one, surface.isel(time=part))
 
 
-@pytest.mark.parametrize("hours", [12, 24, 100])
-@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize(("hours", "workers"), [(12, 2), (24, 2), (100, 2), (100, 4)])
 def test_workers_that_share_the_parts_end_at_about_the_same_time(hours, workers):
     attrs = make_log(np.zeros(4), rate=400.0, unit="deg/h").attrs
     lazy = xr.Dataset(
@@ -157,8 +156,8 @@ def test_workers_that_share_the_parts_end_at_about_the_same_time(hours, workers)
     busy = [0] * workers
     for size in sizes:  # each goes to the worker that is free first
         busy[busy.index(min(busy))] += size
-    assert max(busy) < 1.12 * sum(sizes) / workers
-    assert len(parts) < 0.27 * hours + 10  # what two parts share is read twice
+    assert max(busy) < 1.1 * sum(sizes) / workers
+    assert len(parts) < 0.27 * hours + 4  # what two parts share is read twice
 
 
 def test_a_run_makes_what_the_functions_make(log, whole, tmp_path):

@@ -31,8 +31,10 @@ __all__ = ["davar", "davar_part", "davar_parts"]
 
 #: Samples of a part up to which all its axes are read together.
 _TOGETHER = 2**21
-#: A part gets this share at most of the units of work that are left: threads that share the parts then end at about the same time.
-_SHARE = 1 / 4
+#: Parts at least of a surface of so many units of work, for the threads to share.
+_LEAST_PARTS = 4
+#: A part gets this share at most of the units of work that are left: two threads that share the parts then end at about the same time.
+_SHARE = 1 / 2
 
 
 def davar(
@@ -158,7 +160,7 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     units = units_of_work(size, plan.unit)
     per_unit = max(1, units[0].stop - units[0].start)
     cells = axes * plan.unit.ks.size
-    together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit)))
+    together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit), -(-len(units) // _LEAST_PARTS)))
     edges = [0]
     while left := len(units) - edges[-1]:
         edges.append(edges[-1] + max(1, min(together, int(left * _SHARE))))

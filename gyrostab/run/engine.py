@@ -22,7 +22,7 @@ __all__ = ["Blocks", "compute_blocks", "compute_part", "share_constant", "write_
 #: Finished parts by their number.
 Blocks = dict[int, Block]
 _HELD_SECONDS, _HELD_BYTES = 1.0, 2**26  # results wait so long at most until the inputs are looked at again
-_LOOKS = 20  # and no longer than so many of the looks take: what has been written need not be at the end
+_LOOKS = 50  # and no longer than so many of the looks take: what has been written need not be at the end
 
 
 def compute_part(log: xr.Dataset, part: slice, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None) -> xr.Dataset:
