@@ -20,7 +20,18 @@ from gyrostab.cf import from_disk, index_dim, to_disk
 from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.output import new_output
 from gyrostab.schema import check_log, check_product, check_surface
-from gyrostab.store import Misfit, Progress, append_netcdf, append_zarr, as_counts, chunk_samples, long_variables, open_stored
+from gyrostab.store import (
+    Misfit,
+    Progress,
+    append_deflated,
+    append_netcdf,
+    append_zarr,
+    as_counts,
+    chunk_samples,
+    large_variables,
+    long_variables,
+    open_stored,
+)
 
 __all__ = ["open_dataset", "open_log", "open_product", "open_surface", "to_netcdf", "to_zarr"]
 
@@ -53,7 +64,7 @@ def to_netcdf(
     compression : {"zstd", "zlib"}, optional
         zstd is two to four times as fast, zlib is read by every NetCDF program. By default zstd for a log, zlib for everything else.
     progress : callable, optional
-        Told the share of a lazy log that is written.
+        Told the share of the long variables that is written.
 
     Returns
     -------
@@ -84,12 +95,13 @@ def to_netcdf(
     filters = _filters(compression, log=_rate(stored) is not None)
 
     def write(packed: xr.Dataset) -> None:
-        long = long_variables(packed) if _rate(packed) is not None else {}
+        log = _rate(packed) is not None
         encoding = _netcdf_encoding(packed, filters)
+        long = long_variables(packed) if log else large_variables(packed, encoding)
         rest = {name: options for name, options in encoding.items() if name not in long}
         with new_output(path, overwrite=overwrite) as temporary:
             packed.drop_vars(long).to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=rest)
-            append_netcdf(temporary, long, encoding, progress=progress)
+            (append_netcdf if log else append_deflated)(temporary, long, encoding, progress=progress)
 
     _write_counts(stored, write)
     return Path(path)
@@ -136,7 +148,7 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
     overwrite : bool
         Replace an existing store.
     progress : callable, optional
-        Told the share of a lazy log that is written.
+        Told the share of the long variables that is written.
 
     Returns
     -------

@@ -16,7 +16,8 @@ from gyrostab.export import open_log
 from gyrostab.fit import fit_noise, fit_part
 from gyrostab.join import join_logs
 from gyrostab.join.lazy import lay
-from gyrostab.read.buffers import Spool, lazily
+from gyrostab.read.buffers import lazily
+from gyrostab.read.pieces import Spool
 from gyrostab.regularise import fill
 from gyrostab.regularise.place import Placement
 from gyrostab.run import checkpoint, load_log, run

@@ -22,10 +22,12 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from gyrostab import export
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.export import open_dataset, open_log, open_product, open_surface, to_netcdf, to_zarr
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
+from gyrostab.store import deflate
 from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import INNER
 from tests import synthetic
@@ -352,3 +354,32 @@ def test_a_flipped_bit_is_noticed(tmp_path):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :])
         with open_product(path) as copy, pytest.raises((RuntimeError, OSError)):
             copy.load()
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+def test_chunks_that_threads_compress_are_those_of_the_library(tmp_path, monkeypatch, lazy):
+    product = synthetic.product()
+    product["avar"][0, 1, 2] = np.nan
+    monkeypatch.setattr(export, "CHUNK_VALUES", 50)  # several chunks, the last of them not full
+    monkeypatch.setattr(deflate, "_LARGE", 10**9)
+    by_library = to_netcdf(product, tmp_path / "library.nc")
+    monkeypatch.setattr(deflate, "_LARGE", 1)
+    by_threads = to_netcdf(product.chunk({"axis": 1, "time": 3}) if lazy else product, tmp_path / "threads.nc")
+    with netCDF4.Dataset(by_library) as wanted, netCDF4.Dataset(by_threads) as found:
+        assert set(found.variables) == set(wanted.variables)
+        for name, one in wanted.variables.items():
+            other = found[name]
+            assert str({key: one.getncattr(key) for key in one.ncattrs()}) == str({key: other.getncattr(key) for key in other.ncattrs()})
+            assert (one.dtype, one.dimensions, one.chunking()) == (other.dtype, other.dimensions, other.chunking())
+            assert one.filters() == other.filters()
+    several = 0
+    with h5py.File(by_library) as wanted, h5py.File(by_threads) as found:
+        for name in product.data_vars:
+            one, other = wanted[name].id, found[name].id
+            if wanted[name].chunks is None:
+                continue
+            several += one.get_num_chunks() > 1
+            assert one.get_num_chunks() == other.get_num_chunks()
+            for place in (one.get_chunk_info(number).chunk_offset for number in range(one.get_num_chunks())):
+                assert one.read_direct_chunk(place) == other.read_direct_chunk(place)
+    assert several > 5

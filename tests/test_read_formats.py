@@ -18,7 +18,8 @@ from scipy.io import savemat
 
 from gyrostab.errors import FormatError, MissingUnitError, OptionError
 from gyrostab.read import ReadOptions, read_log, readers, scan_file
-from gyrostab.read.buffers import Buffers, Spool, Stored, lazily, put, take
+from gyrostab.read.buffers import Buffers, lazily, put, take
+from gyrostab.read.pieces import Pieces, Spool
 from gyrostab.schema import check_raw
 
 ROWS = 500
@@ -321,7 +322,7 @@ def test_buffers_spill_and_give_back() -> None:
         for block in blocks:
             buffers.add(block)
         found = buffers.finish()
-        assert isinstance(found["a"], Stored) == (limit < 10**6)
+        assert isinstance(found["a"], Pieces) == (limit < 10**6)
         for key in "ab":
             np.testing.assert_array_equal(np.asarray(lazily(found[key])), expected[key])
             for part in (slice(3, 38), slice(6, 6), slice(1, 40, 7), slice(-9, None)):

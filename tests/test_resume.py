@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
@@ -20,6 +21,7 @@ from gyrostab.davar import davar_part, davar_parts
 from gyrostab.export import open_log
 from gyrostab.run import checkpoint, engine
 from gyrostab.run.job import folder_of, hold
+from gyrostab.timegrid import time_coordinate
 from tests.crashing import WINDOW
 
 pytestmark = pytest.mark.xdist_group("resume")
@@ -139,6 +141,23 @@ def test_parts_are_cuts_of_the_whole_bit_for_bit():
     for part in [*parts, slice(370, 380), slice(0, 1), slice(5, surface.sizes["time"])]:
         one = davar_part(log.chunk({"time": 77_777}), part=part, **options)
         xr.testing.assert_identical(one, surface.isel(time=part))
+
+
+@pytest.mark.parametrize(("hours", "workers"), [(12, 2), (24, 2), (100, 2), (100, 4)])
+def test_workers_that_share_the_parts_end_at_about_the_same_time(hours, workers):
+    attrs = make_log(np.zeros(4), rate=400.0, unit="deg/h").attrs
+    lazy = xr.Dataset(
+        {"rate": (("axis", "time"), da.zeros((3, hours * 1_440_000), chunks=480_000), {"units": "degree hour-1"})},
+        {"axis": list("xyz")}, attrs,
+    ).assign_coords(time_coordinate(0, 400.0, hours * 1_440_000))  # fmt: skip
+    parts = davar_parts(lazy, samples=2**24, window="10min", step="1min")
+    sizes = [part.stop - part.start for part in parts]
+    assert sum(sizes) == parts[-1].stop
+    busy = [0] * workers
+    for size in sizes:  # each goes to the worker that is free first
+        busy[busy.index(min(busy))] += size
+    assert max(busy) < 1.1 * sum(sizes) / workers
+    assert len(parts) < 0.27 * hours + 4  # what two parts share is read twice
 
 
 def test_a_run_makes_what_the_functions_make(log, whole, tmp_path):

@@ -33,6 +33,8 @@ __all__ = ["davar", "davar_part", "davar_parts"]
 _TOGETHER = 2**21
 #: Parts at least of a surface of so many units of work, for the threads to share.
 _LEAST_PARTS = 4
+#: A part gets this share at most of the units of work that are left: two threads that share the parts then end at about the same time.
+_SHARE = 1 / 2
 
 
 def davar(
@@ -131,7 +133,7 @@ def davar(
 
 
 def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> list[slice]:
-    """Cut the windows of a surface into parts that `davar_part` computes, each of whole units of work.
+    """Cut the windows of a surface into parts that `davar_part` computes, each of whole units of work, the last ones smaller.
 
     Parameters
     ----------
@@ -159,7 +161,9 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     per_unit = max(1, units[0].stop - units[0].start)
     cells = axes * plan.unit.ks.size
     together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit), -(-len(units) // _LEAST_PARTS)))
-    edges = [number * len(units) // count for count in [-(-len(units) // together)] for number in range(count + 1)]
+    edges = [0]
+    while left := len(units) - edges[-1]:
+        edges.append(edges[-1] + max(1, min(together, int(left * _SHARE))))
     return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
 
 

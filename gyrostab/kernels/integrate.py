@@ -90,27 +90,31 @@ def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def
 
 
 @njit(**INNER)
-def _edges(x, starts, stops):  # type: ignore[no-untyped-def]
+def _edges(x, step, known, starts, stops):  # type: ignore[no-untyped-def]
     """Number of runs of finite samples; the first of them, as many as there is room for, to `starts` and `stops`."""
     run = 0
     inside = False
-    for a in range(0, x.size, _STRIP):
-        b = min(a + _STRIP, x.size)
-        finite = 0
-        for i in range(np.uint64(a), np.uint64(b)):
-            finite += np.isfinite(x[i])
-        if finite == (b - a if inside else 0):
+    for block in range(known.size):
+        first, last = block * step, min((block + 1) * step, x.size) if block + 1 < known.size else x.size
+        if inside and known[block] == last - first:
             continue
-        for i in range(a, b):
-            if np.isfinite(x[i]) == inside:
+        for a in range(first, last, _STRIP):
+            b = min(a + _STRIP, last)
+            finite = 0
+            for i in range(np.uint64(a), np.uint64(b)):
+                finite += np.isfinite(x[i])
+            if finite == (b - a if inside else 0):
                 continue
-            if run < starts.size:
-                if inside:
-                    stops[run] = i
-                else:
-                    starts[run] = i
-            run += inside
-            inside = not inside
+            for i in range(a, b):
+                if np.isfinite(x[i]) == inside:
+                    continue
+                if run < starts.size:
+                    if inside:
+                        stops[run] = i
+                    else:
+                        starts[run] = i
+                run += inside
+                inside = not inside
     if inside:
         if run < starts.size:
             stops[run] = x.size
@@ -119,13 +123,23 @@ def _edges(x, starts, stops):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def present_runs(x):  # type: ignore[no-untyped-def]
-    """First and one-past-last index of every run of finite samples: two int64 arrays."""
+def present_runs(x, step, known):  # type: ignore[no-untyped-def]
+    """First and one-past-last index of every run of finite samples: two int64 arrays.
+
+    Parameters
+    ----------
+    x : ndarray (n,)
+        Samples.
+    step : int
+        Samples of a block; the last one has the rest.
+    known : float64 (n_blocks,)
+        Finite samples of each block, or -1 where that is not known; of a whole block none is looked at.
+    """
     runs = np.empty((2, x.size // 256 + 16), np.int64)
-    count = _edges(x, runs[0], runs[1])
+    count = _edges(x, step, known, runs[0], runs[1])
     if count > runs.shape[1]:
         runs = np.empty((2, count), np.int64)
-        _edges(x, runs[0], runs[1])
+        _edges(x, step, known, runs[0], runs[1])
     return runs[0, :count], runs[1, :count]
 
 

@@ -331,12 +331,30 @@ def _note(events, n, cause, sample, row, before, stamp):  # type: ignore[no-unty
 
 
 @njit(**INNER)
+def _even(rows, stamps, j, n, period, expected, row, stamp0):  # type: ignore[no-untyped-def]
+    """The first row from j on that is not the one after the last, or whose stamp is not exactly `expected` samples after `stamp0`.
+
+    No row waits here for what the ones before did to the phase, which they leave at zero.
+    """
+    first = j
+    while j < n and rows[j] == row + 1 + j - first and (stamps[j] - stamp0) / period == expected + j - first:
+        j += 1
+    return j
+
+
+@njit(**INNER)
 def _on_time(rows, stamps, j, n, period, hold, state, ring):  # type: ignore[no-untyped-def]
     """Place rows as long as each is the one after the last and on time for the next sample; the first that is not."""
     head, row, latest, phase = state[_HEAD], state[_ROW], state[_LATEST], state[_PHASE]
     grid0, stamp0, begin = state[_GRID0], state[_STAMP0], j
     if not state[STARTED] or state[_PENDING]:
         return j
+    if phase == 0:
+        j = _even(rows, stamps, j, n, period, head + 1 - grid0, row, stamp0)
+        for g in range(max(begin, j - len(ring)), j):
+            ring[(head + 1 + g - begin) & (len(ring) - 1)] = True
+        if j > begin:
+            head, row, latest = head + j - begin, row + j - begin, max(latest, stamps[j - 1])
     while j < n and rows[j] == row + 1 and stamps[j] != NO_STAMP:
         ahead = grid0 - phase * _UNIT + (stamps[j] - stamp0) / period - (head + 1)
         if abs(ahead) > 0.5 or abs(phase * _UNIT) > hold:

@@ -205,13 +205,14 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
     x = _native(x)
     n_windows = _number_of_windows(x, unit)
     cells = np.empty((len(CELL_FIELDS), n_windows, unit.ks.size))
-    means, mean, present = _means(x, unit, n_windows)
+    means, mean, known = _means(x, unit, n_windows)
+    present = int(known.sum())
     if present == 0:
         cells[:] = 0.0
         cells[0], cells[5:] = np.nan, np.nan
         return cells, means
     gaps = present < x.size
-    starts, stops = present_runs(x) if gaps else (np.zeros(1, np.int64), np.full(1, x.size))
+    starts, stops = present_runs(x, unit.step if known.size > 1 else x.size, known) if gaps else (np.zeros(1, np.int64), np.full(1, x.size))
     angle = _angle(x, unit, starts, stops, float(np.rint(mean)) if counts_only else mean)  # integers less an integer: every sum is exact
     sums, counts = _strict_sums(angle, unit, n_windows, gaps)
     full = full_counts(unit.window, unit.step, n_windows, unit.ks, unit.shifts)
@@ -234,19 +235,19 @@ def _number_of_windows(x: NDArray[np.generic], unit: Unit) -> int:
     return int((x.size - unit.window - (1 if unit.angle else 0)) // unit.step + 1)
 
 
-def _means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> tuple[Floats, float, int]:
-    """Means and coverage of the windows, mean of the stretch, number of samples present in it."""
+def _means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> tuple[Floats, float, Floats]:
+    """Means and coverage of the windows, mean of the stretch, number of samples present in each of its blocks (of angles: in all of it)."""
     if unit.angle:
-        return _angle_means(x, unit, n_windows), np.nan, int(np.isfinite(x).sum())
+        return _angle_means(x, unit, n_windows), np.nan, np.array([float(np.isfinite(x).sum())])
     base = first_present(x)
     if np.isnan(base):
-        return np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)]), np.nan, 0
+        return np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)]), np.nan, np.zeros(1)
     heads, tails = block_sums(x, base, unit.window, unit.step, n_windows)  # less the first sample: small on a tool that turns
     total, present = heads.sum(axis=0) + tails.sum(axis=0)
     windows = windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), n_windows)
     with np.errstate(invalid="ignore", divide="ignore"):
         means = np.stack([base + windows[:, 0] / windows[:, 1], windows[:, 1] / unit.window])
-    return means, base + total / present, int(present)
+    return means, base + total / present, heads[:, 1] + tails[:, 1]
 
 
 def _angle_means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> Floats:

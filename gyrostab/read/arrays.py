@@ -85,7 +85,7 @@ def take_batch(intake: Intake, options: ReadOptions, batch: dict[int, Any]) -> N
         values[column.source], odd = to_floats(batch[column.source])
         words += odd if column.role == "channel" else 0
     stamps = None if intake.time is None else to_stamps(batch[intake.time.source], intake.time, options)
-    intake.add(values, stamps, words=words)
+    intake.add(intake.prepare(values, stamps, words=words))
 
 
 def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:

@@ -1,118 +1,41 @@
-"""Growing columns that move from memory to an unlinked temporary file when they become large.
-
-They are read back with `os.pread`, not mapped: pages of a mapped file would count as memory of this process, more and more of them
-as a long log is gone through, and every map holds a file handle of its own, of which hundreds of files would need thousands.
-"""
+"""Growing columns that move from memory to an unlinked temporary file when they become large."""
 
 from __future__ import annotations
 
-import os
-import tempfile
 import uuid
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.errors import OutputError
+from gyrostab.read.pieces import Piece, Pieces, Spool, Words
 from gyrostab.store.direct import stack_rows, with_fill
 
-__all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "Spool", "Stored", "lazily", "put", "take", "together"]
+__all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "lazily", "pieces_of", "put", "take", "together"]
 
 #: Columns of one file together stay in memory up to this size [bytes].
 SPILL_BYTES = 128 * 2**20
 
-#: Rows of one dask chunk of a column on disk.
+#: Rows of one dask chunk of a column in pieces.
 CHUNK_ROWS = 2**21
 
-
-class Spool:
-    """A temporary file without a name, which the system removes with the last reference to it."""
-
-    def __init__(self) -> None:
-        self.file: IO[bytes] | None = None
-        self.end = 0
-
-    def add(self, values: NDArray[Any]) -> int:
-        """Append an array; the byte at which it begins."""
-        try:
-            if self.file is None:
-                self.file = tempfile.TemporaryFile(prefix="gyrostab-")  # noqa: SIM115
-            self.file.write(values.data)
-            self.file.flush()
-        except OSError as error:
-            where = tempfile.gettempdir()
-            raise OutputError(
-                f"{where}: the columns of a long log are kept there while it is read, and cannot be written ({error.strerror}); "
-                "make room, or name a larger place in the environment variable TMPDIR"
-            ) from error
-        begin, self.end = self.end, self.end + values.nbytes
-        return begin
-
-    def store(self, values: NDArray[Any]) -> Stored:
-        """Move a column to the file."""
-        whole = np.ascontiguousarray(values).view(np.int64)
-        return Stored(self, values.dtype, [0, len(values)], [self.add(whole)])
-
-    @property
-    def handle(self) -> int:
-        """Number of the open file."""
-        assert self.file is not None
-        return self.file.fileno()
+#: Values of all columns of a file up to which they are put together to plain arrays.
+_SMALL = 2**21
 
 
-class Stored:
-    """A column of 8-byte values in a spool, behind the few attributes that dask asks for; dask copies whatever has a ``copy``."""
-
-    ndim = 1
-
-    def __init__(self, spool: Spool, dtype: Any, rows: list[int], places: list[int]):
-        self.spool, self.dtype = spool, np.dtype(dtype)
-        self._rows, self._places = rows, places  # the rows at which the pieces begin, and the end of the last; the bytes they begin at
-        self.shape = (rows[-1],)
-
-    def view(self, dtype: Any) -> Stored:
-        """The same bytes as another type."""
-        return Stored(self.spool, dtype, self._rows, self._places)
-
-    def place(self, row: int) -> int:
-        """The byte at which a row stands."""
-        piece = bisect_right(self._rows, row) - 1
-        return self._places[piece] + 8 * (row - self._rows[piece])
-
-    def __getitem__(self, part: Any) -> NDArray[Any]:
-        rows = range(*(part[0] if isinstance(part, tuple) else part).indices(self.shape[0]))
-        out = np.empty(max(rows.stop - rows.start, 0), dtype=self.dtype)
-        self.fill(0, rows.start, out)
-        return out[:: rows.step]
-
-    def fill(self, _row: int, begin: int, out: NDArray[Any]) -> None:
-        """The values from row `begin` of the log on: `gyrostab.store.direct.Fill`."""
-        values = out.view(np.int64)
-        done = 0
-        while done < len(values):
-            row = begin + done
-            most = self._rows[bisect_right(self._rows, row)] - row
-            got = os.preadv(self.spool.handle, [values[done : done + most].data.cast("B")], self.place(row))
-            if got < 8:
-                raise OSError("the temporary file of a long log is shorter than it was")
-            done += got // 8
-
-
-def take(column: NDArray[Any] | Stored, rows: NDArray[np.int64]) -> NDArray[Any]:
+def take(column: NDArray[Any] | Pieces, rows: NDArray[np.int64]) -> NDArray[Any]:
     """The values of a few rows."""
-    if isinstance(column, Stored):
+    if isinstance(column, Pieces):
         return np.concatenate([np.empty(0, column.dtype), *(column[row : row + 1] for row in rows.tolist())])
     return np.asarray(column[rows])
 
 
-def put(column: NDArray[Any] | Stored, rows: NDArray[np.int64], value: int) -> None:
+def put(column: NDArray[Any] | Pieces, rows: NDArray[np.int64], value: int) -> None:
     """Change a few rows."""
-    if isinstance(column, Stored):
+    if isinstance(column, Pieces):
         for row in rows.tolist():
-            os.pwrite(column.spool.handle, np.int64(value).tobytes(), column.place(row))
+            column.put(row, value)
     else:
         column[rows] = value
 
@@ -120,8 +43,8 @@ def put(column: NDArray[Any] | Stored, rows: NDArray[np.int64], value: int) -> N
 class Buffers:
     """Columns of 8-byte numbers that grow block by block.
 
-    Up to `limit` bytes they are lists of arrays; beyond it they are appended to a spool. In memory, the columns `rows_of` become the
-    rows of one array.
+    Up to `limit` bytes they stay in memory; beyond it they are appended to a spool. Where they are few and in memory, they end as
+    arrays, of which the columns `rows_of` are the rows of one.
     """
 
     def __init__(self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES, rows_of: Sequence[Any] = ()):
@@ -129,57 +52,74 @@ class Buffers:
         self.dtypes = {key: np.dtype(dtype) for key, dtype in dtypes.items()}
         self.limit = limit
         self.rows = 0
-        self._parts: dict[Any, list[NDArray[Any]]] = {key: [] for key in dtypes}
+        self._pieces: dict[Any, list[Piece]] = {key: [] for key in dtypes}
         self._spool: Spool | None = None
-        self._pieces: dict[Any, tuple[list[int], list[int]]] = {key: ([0], []) for key in dtypes}
+        self._held = self._moved = 0  # bytes in memory; pieces of each column that were spilled
 
-    def add(self, block: Mapping[Any, NDArray[Any]]) -> None:
+    def add(self, block: Mapping[Any, NDArray[Any] | Piece]) -> None:
         """Append one block: every column, all of one length."""
-        self.rows += len(next(iter(block.values())))
+        size = 0
         for key, values in block.items():
-            self._parts[key].append(np.ascontiguousarray(values, dtype=self.dtypes[key]))
-        if self._spool or self.rows * sum(dtype.itemsize for dtype in self.dtypes.values()) > self.limit:
+            piece = self._words(key, values) if isinstance(values, np.ndarray) else values
+            self._pieces[key].append(piece)
+            self._held += piece.held
+            size = piece.rows
+        self.rows += size
+        if self._spool or self._held > self.limit:
             self._spill()
 
-    def _spill(self) -> None:
-        self._spool = self._spool or Spool()
-        for key, parts in self._parts.items():
-            rows, places = self._pieces[key]
-            for part in parts:
-                if len(part):
-                    places.append(self._spool.add(part))
-                    rows.append(rows[-1] + len(part))
-            parts.clear()
+    def _words(self, key: Any, values: NDArray[Any]) -> Piece:
+        whole = np.ascontiguousarray(values, dtype=self.dtypes[key])
+        if isinstance(whole.base, np.ndarray) and whole.base.nbytes > whole.nbytes:
+            whole = whole.copy()  # or else what it is a part of would stay in memory
+        return Words(whole.view(np.int64))
 
-    def finish(self) -> dict[Any, NDArray[Any] | Stored]:
-        """The columns: arrays in memory, or columns in a temporary file."""
-        if self._spool is None:
-            matrix = np.empty((len(self.rows_of), self.rows))
-            found: dict[Any, NDArray[Any] | Stored] = {}
-            for key, parts in self._parts.items():
-                column = matrix[self.rows_of.index(key)] if key in self.rows_of else np.empty(self.rows, self.dtypes[key])
-                if parts:
-                    np.concatenate(parts, out=column)
-                parts.clear()
+    def _spill(self) -> None:
+        self._spool = spool = self._spool or Spool()
+        for pieces in self._pieces.values():
+            pieces[self._moved :] = [piece.spilled(spool) for piece in pieces[self._moved :]]
+        self._held, self._moved = 0, max(map(len, self._pieces.values()))
+
+    def finish(self) -> dict[Any, NDArray[Any] | Pieces]:
+        """The columns: arrays where they are small, or else in pieces."""
+        found: dict[Any, NDArray[Any] | Pieces] = {}
+        small = self._spool is None and self.rows * len(self._pieces) <= _SMALL
+        matrix = np.empty((len(self.rows_of), self.rows if small else 0))
+        for key, pieces in self._pieces.items():
+            column = Pieces(self.dtypes[key], pieces)
+            pieces.clear()
+            if small:
+                plain = matrix[self.rows_of.index(key)] if key in self.rows_of else np.empty(self.rows, self.dtypes[key])
+                column.fill(0, 0, plain)
+                found[key] = plain
+            else:
                 found[key] = column
-            return found
-        return {key: Stored(self._spool, self.dtypes[key], *pieces) for key, pieces in self._pieces.items()}
+        return found
 
 
 def together(columns: Sequence[Any]) -> Any:
     """Columns as the rows of one array, numpy if they are, without a copy if they are the rows of one already."""
     if not isinstance(columns[0], np.ndarray):
-        return stack_rows(columns)
+        stacked = stack_rows(columns)
+        stacked.gyrostab_pieces = [pieces for column in columns for pieces in pieces_of(column)]
+        return stacked
     whole = columns[0].base
     same = whole is not None and whole.ndim == 2 and len(whole) == len(columns) and all(column.base is whole for column in columns)
     return whole if same else np.stack(columns)
 
 
-def lazily(values: NDArray[Any] | Stored) -> Any:
-    """A dask array over a column in a temporary file; an array in memory is returned as it is."""
-    if not isinstance(values, Stored):
+def lazily(values: NDArray[Any] | Pieces) -> Any:
+    """A dask array over a column in pieces; an array in memory is returned as it is."""
+    if not isinstance(values, Pieces):
         return values
     import dask.array
 
     name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
-    return with_fill(dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta), values.fill)
+    lazy = with_fill(dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta), values.fill)
+    lazy.gyrostab_pieces = [values]
+    return lazy
+
+
+def pieces_of(array: Any) -> list[Pieces]:
+    """The columns in pieces that an array of `lazily` or `together` reads."""
+    return list(getattr(array, "gyrostab_pieces", ()))

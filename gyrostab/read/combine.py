@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.join import some, together
-from gyrostab.read.buffers import CHUNK_ROWS, Spool, lazily
+from gyrostab.read.buffers import CHUNK_ROWS, lazily, pieces_of
 from gyrostab.read.overlap import drop_repeats
+from gyrostab.read.pieces import Pieces, Spool
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store import common_packing
 from gyrostab.store.direct import end_to_end, one_row, stack_rows
@@ -22,7 +23,12 @@ __all__ = ["attach_channels", "concatenate", "memory", "to_disk", "with_channels
 
 def memory(part: xr.Dataset) -> int:
     """Bytes of the columns of a raw log that are held in memory."""
-    return sum(variable.nbytes for variable in part.variables.values() if isinstance(variable._data, np.ndarray))
+    arrays = sum(variable.nbytes for variable in part.variables.values() if isinstance(variable._data, np.ndarray))
+    return arrays + sum(pieces.held for pieces in _pieces(part))
+
+
+def _pieces(part: xr.Dataset) -> list[Pieces]:
+    return [pieces for variable in part.variables.values() for pieces in pieces_of(variable._data)]
 
 
 def to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
@@ -32,6 +38,8 @@ def to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
         values = variable.values
         return lazily(spool.store(values)) if values.ndim == 1 else stack_rows([lazily(spool.store(row)) for row in values])
 
+    for pieces in _pieces(part):
+        pieces.spill(spool)
     long = {name: variable for name, variable in part.variables.items() if name != "axis" and isinstance(variable._data, np.ndarray)}
     return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
 

@@ -3,28 +3,34 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
+from threading import Event
 from typing import Any, Protocol, cast
 
 import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.join import join_logs, log_span
-from gyrostab.read.buffers import SPILL_BYTES, Spool
+from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
 from gyrostab.read.lost import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.overlap import stamp_span
+from gyrostab.read.pieces import Spool
 from gyrostab.schema import texts
 
 __all__ = ["OnFile", "Reader", "read_log", "readers", "scan_file"]
 
 GROUP = "gyrostab.readers"
+#: Text files that are read side by side.
+_TOGETHER = 2
 
 #: Called with the number of a file, the number of files and the path.
 OnFile = Callable[[int, int, Path], None]
@@ -261,23 +267,55 @@ def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | Non
     lost: list[LostFile] = []
     spool = Spool()
     held = 0
-    for number, path in enumerate(paths, 1):
-        if on_file is not None:
-            on_file(number, len(paths), path)
-        try:
-            part = _read(path, options)
-        except (GyrostabError, OSError) as error:
-            if options.strict or len(paths) == 1 or not is_damage(path, error):
-                raise
-            lost.append(LostFile(path, reason_of(path, error)))
-            continue
-        held += memory(part)
-        if held > SPILL_BYTES and len(paths) > 1:
-            held -= memory(part)
-            part = to_disk(part, spool)
-        parts[path] = part
+    with closing(_ahead(paths, options, on_file)) as reading:
+        for path, read in zip(paths, reading, strict=True):
+            try:
+                part = read()
+            except (GyrostabError, OSError) as error:
+                if options.strict or len(paths) == 1 or not is_damage(path, error):
+                    raise
+                lost.append(LostFile(path, reason_of(path, error)))
+                continue
+            held += memory(part)
+            if held > SPILL_BYTES and len(paths) > 1:
+                held -= memory(part)
+                part = to_disk(part, spool)
+            parts[path] = part
     check_share(lost, len(paths))
     return parts, lost
+
+
+def _ahead(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None) -> Generator[Callable[[], xr.Dataset], None, None]:
+    """What reads each file; a text file is read already, while the one before it is looked at, as its beginning takes one thread."""
+    stop = Event()
+    with ThreadPoolExecutor(_TOGETHER, thread_name_prefix="gyrostab-file") as pool:
+        waiting: deque[Callable[[], xr.Dataset]] = deque()
+        try:
+            for number, path in enumerate(paths, 1):
+                if on_file is not None:
+                    on_file(number, len(paths), path)
+                early = len(paths) > 1 and _is_text(path)
+                waiting.append(pool.submit(_read_text, path, options, stop).result if early else partial(_read, path, options))
+                if len(waiting) == _TOGETHER:
+                    yield waiting.popleft()
+            while waiting:
+                yield waiting.popleft()
+        finally:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _read_text(path: Path, options: ReadOptions, stop: Event) -> xr.Dataset:
+    reader = _registered()["text"].load()
+    with _damage_named(path):
+        return cast(xr.Dataset, reader.read(path, options, stop=stop.is_set))
+
+
+def _is_text(path: Path) -> bool:
+    try:
+        return bool(_reader(path) is _registered()["text"].load())
+    except FormatError:
+        return False  # which reading will say
 
 
 def _spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.read.buffers import SPILL_BYTES, Buffers, Stored, lazily, put, take, together
+from gyrostab.read.buffers import SPILL_BYTES, Buffers, lazily, put, take, together
 from gyrostab.read.columns import Column, Plan
 from gyrostab.read.options import FileSummary, ReadOptions
+from gyrostab.read.pieces import Counts, Piece, Pieces, Steps
 from gyrostab.read.stamps import NAT
 from gyrostab.schema import SIGNAL_UNITS
 
-__all__ = ["Intake", "summary_of"]
+__all__ = ["Intake", "Taken", "summary_of"]
 
 #: How many bad places a note names.
 NAMED = 10
@@ -25,6 +26,43 @@ MAX_UNREADABLE = 0.5
 
 Values = dict[int, NDArray[np.float64]]
 Locate = Callable[[Sequence[int]], list[str]]
+
+
+class Taken(NamedTuple):
+    """A block of rows as `Intake.add` takes it; rows are counted from its first.
+
+    Attributes
+    ----------
+    rows : int
+        Rows.
+    block : dict
+        Column number -> values in the inner unit, or a piece of the column.
+    ranges : dict
+        Column number -> values missing, range of the others as they stand in the file, whether these are whole numbers.
+    bad_rows, cell_rows : ndarray of int64
+        Rows that are unreadable, and others in which a gyro cell is.
+    bad_cells, cells : int
+        Cells that are unreadable, and gyro cells of `cell_rows`.
+    low, high : int
+        Range of the stamps of readable rows [ns since 1970]; the other way round where there are none.
+    """
+
+    rows: int
+    block: dict[int, NDArray[Any] | Piece]
+    ranges: dict[int, tuple[int, float, float, bool]]
+    bad_rows: NDArray[np.int64]
+    cell_rows: NDArray[np.int64]
+    bad_cells: int
+    cells: int
+    low: int
+    high: int
+
+
+_NO_ROWS = np.empty(0, np.int64)
+
+
+def _not_finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return ~np.isfinite(values)
 
 
 def _row_names(first: int) -> Locate:
@@ -52,6 +90,7 @@ class Intake:
         if self.time is not None:
             dtypes[self.time.source] = np.int64
         self.buffers = Buffers(dtypes, limit=limit, rows_of=[column.source for column in self.gyro])
+        self.tens = {column.source: 1.0 for column in [*self.gyro, *self.channels]}  # powers of ten that are tried; 0 for none
         self.bad_rows = self.bad_cells = self.cells = self.cell_rows = 0
         self.bad_places: list[str] = []
         self.cell_places: list[str] = []
@@ -59,8 +98,8 @@ class Intake:
         self.low, self.high = np.iinfo(np.int64).max, NAT
         self.whole: dict[int, tuple[float, float] | None] = {column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]}
 
-    def add(self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0, locate: Locate | None = None) -> None:
-        """Take one block.
+    def prepare(self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0) -> Taken:
+        """Convert one block, and pack what can be packed; several threads may do so side by side.
 
         Parameters
         ----------
@@ -70,40 +109,81 @@ class Intake:
             Stamps [ns since 1970], `NAT` where unreadable; None without a time column.
         words : int
             Cells of channels that hold something that is no number (empty ones are not filled, which is no fault).
+        """
+        from gyrostab.kernels.decimals import even_steps
+
+        size = len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
+        if size == 0:
+            return Taken(0, {}, {}, _NO_ROWS, _NO_ROWS, 0, 0, np.iinfo(np.int64).max, NAT)
+        bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
+        block: dict[int, NDArray[Any] | Piece] = {}
+        bad_cells, ranges, masks = words + int(np.count_nonzero(bad)), {}, []
+        for column in [*self.gyro, *self.channels]:
+            source = column.source
+            block[source], ranges[source] = self._convert(column, values[source])
+            unknown = np.isnan if block[source] is values[source] else _not_finite  # what is packed is not converted yet
+            masks.append(unknown(values[source]) if ranges[source][0] else None)
+        gyro = [mask for mask in masks[: len(self.gyro)] if mask is not None]
+        bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro)
+        if self.gyro and all(mask is not None for mask in masks):
+            bad = bad | np.logical_and.reduce([mask for mask in masks if mask is not None])
+        any_bad = bool(bad.any())
+        others = [mask & ~bad for mask in gyro]
+        low, high = np.iinfo(np.int64).max, NAT
+        if stamps is not None and self.time is not None:
+            good = stamps[~bad] if any_bad else stamps
+            if len(good):
+                low, high = int(good.min()), int(good.max())
+            table = even_steps(stamps)
+            block[self.time.source] = stamps if table is None else Steps(table, size)
+        return Taken(
+            size, block, ranges, np.flatnonzero(bad) if any_bad else _NO_ROWS,
+            np.flatnonzero(np.logical_or.reduce(others)) if others else _NO_ROWS,
+            bad_cells, sum(int(np.count_nonzero(mask)) for mask in others), low, high,
+        )  # fmt: skip
+
+    def add(self, taken: Taken, locate: Locate | None = None) -> None:
+        """Take one block.
+
+        Parameters
+        ----------
+        taken : Taken
+            From `prepare`.
         locate : callable, optional
             Row numbers within the block -> how a message calls them.
         """
-        size = len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
-        if size == 0:
+        if taken.rows == 0:
             return
         locate = locate or _row_names(self.buffers.rows)
-        bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
-        missing = [self._clean(column, values[column.source]) for column in [*self.gyro, *self.channels]]
-        self.bad_cells += words + int(np.count_nonzero(bad))
-        gyro_missing = [mask for mask in missing[: len(self.gyro)] if mask is not None]
-        self.bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro_missing)
-        if self.gyro and all(mask is not None for mask in missing):
-            bad = bad | np.logical_and.reduce([mask for mask in missing if mask is not None])
-        if bad.any():
-            self._note_rows(np.flatnonzero(bad), locate)
-        self._note_cells([mask & ~bad for mask in gyro_missing], locate)
-        block: dict[int, Any] = dict(values)
-        if stamps is not None and self.time is not None:
-            good = stamps[~bad] if bad.any() else stamps
-            if len(good):
-                self.low, self.high = min(self.low, int(good.min())), max(self.high, int(good.max()))
-            block[self.time.source] = stamps
-        self.buffers.add(block)
+        self.bad_cells += taken.bad_cells
+        for source, (missing, low, high, whole) in taken.ranges.items():
+            span = self.whole[source]
+            if span is not None and missing < taken.rows:
+                self.whole[source] = (min(span[0], low), max(span[1], high)) if whole else None
+        if taken.bad_rows.size:
+            self._note_rows(taken.bad_rows, locate)
+        if taken.cell_rows.size:
+            self._note_cells(taken.cell_rows, taken.cells, locate)
+        self.low, self.high = min(self.low, taken.low), max(self.high, taken.high)
+        self.buffers.add(taken.block)
 
-    def _clean(self, column: Column, values: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-        """Convert to the inner unit in place, infinities to NaN; the mask of what is missing, or None when nothing is."""
+    def _convert(self, column: Column, values: NDArray[np.float64]) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
+        """Convert to the inner unit, in place or packed, infinities to NaN; and what `Taken.ranges` tells of the column."""
+        from gyrostab.kernels.decimals import decimals_of, to_decimals
         from gyrostab.kernels.rows import clean_column
 
+        tens = self.tens[column.source]
+        for _ in range(2):
+            counts = np.empty(values.size if tens else 0, np.int32)
+            if tens:
+                fits, *found = to_decimals(values, tens, counts)
+                if fits:
+                    self.tens[column.source] = tens
+                    return Counts(counts, tens, column.factor, column.offset), (found[0], found[1], found[2], found[3])
+            tens = decimals_of(values) if tens else 0.0
+        self.tens[column.source] = 0.0  # no decimals: the next blocks are not tried
         missing, low, high, whole = clean_column(values, column.factor, column.offset)
-        span = self.whole[column.source]
-        if span is not None and missing < len(values):
-            self.whole[column.source] = (min(span[0], low), max(span[1], high)) if whole else None
-        return np.isnan(values) if missing else None
+        return values, (missing, low, high, whole)
 
     def _packing(self, columns: Sequence[Column]) -> dict[str, Any]:
         """The encoding of columns of whole numbers that have one factor; none for others."""
@@ -121,12 +201,11 @@ class Intake:
         if len(self.bad_places) < NAMED:
             self.bad_places += locate([int(row) for row in rows[: NAMED - len(self.bad_places)]])
 
-    def _note_cells(self, masks: list[NDArray[np.bool_]], locate: Locate) -> None:
-        if masks and (rows := np.flatnonzero(np.logical_or.reduce(masks))).size:
-            self.cells += sum(int(np.count_nonzero(mask)) for mask in masks)
-            self.cell_rows += len(rows)
-            if len(self.cell_places) < NAMED:
-                self.cell_places += locate([int(row) for row in rows[: NAMED - len(self.cell_places)]])
+    def _note_cells(self, rows: NDArray[np.int64], cells: int, locate: Locate) -> None:
+        self.cells += cells
+        self.cell_rows += len(rows)
+        if len(self.cell_places) < NAMED:
+            self.cell_places += locate([int(row) for row in rows[: NAMED - len(self.cell_places)]])
 
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
         """The raw log.
@@ -157,7 +236,7 @@ class Intake:
         )
         return dataset
 
-    def _stamps(self, columns: dict[int, NDArray[Any] | Stored]) -> Any:
+    def _stamps(self, columns: dict[int, NDArray[Any] | Pieces]) -> Any:
         if self.time is None:
             return None
         stamps = columns.pop(self.time.source)

@@ -7,12 +7,10 @@ way, and the more of them the longer it gets: a short one cell by cell, a long o
 from __future__ import annotations
 
 import gzip
-import os
 import re
 import zlib
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError
 from functools import partial
 from io import BufferedReader
 from pathlib import Path
@@ -26,10 +24,11 @@ from gyrostab.errors import FormatError
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.cells import Typing, parse_cells, parse_fast, parse_plain, stamp_types
 from gyrostab.read.columns import Column, Plan, plan_columns
-from gyrostab.read.intake import Intake, summary_of
+from gyrostab.read.intake import Intake, Taken, summary_of
 from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.stamps import cells_to_ns, looks_iso
+from gyrostab.threads import in_order
 
 __all__ = ["matches", "read", "scan"]
 
@@ -41,7 +40,6 @@ LINE_BYTES = 2**8
 SHORT_BYTES = 2**13
 PART_BYTES = 2**16
 COUNTED_BYTES = 2**24
-MOST_WORKERS = 4
 
 
 def matches(path: Path) -> bool:
@@ -70,16 +68,17 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return summary_of(plan, "text", rows, head=head, tail=tail, notes=layout.notes)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a text file; see `gyrostab.read.read_log`."""
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES, stop: Callable[[], bool] | None = None) -> xr.Dataset:
+    """The raw log of a text file; see `gyrostab.read.read_log`. Ends with `CancelledError` where `stop` comes to be true."""
     layout, plan = _look(path, options)
     intake = Intake(plan.check(), options, limit=limit)
     typing = Typing(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
-    for taken in _side_by_side(_blocks(path, layout.offset), partial(_take, typing=typing)):
-        for part in taken:
-            if part.rows:
-                intake.add(part.values, part.stamps, words=part.words, locate=partial(_line_names, part, line))
+    for parts in in_order(partial(_take, typing=typing, intake=intake), _blocks(path, layout.offset)):
+        if stop is not None and stop():
+            raise CancelledError
+        for part in parts:
+            intake.add(part.taken, partial(_line_names, part, line))
             line += part.lines
     return intake.finish(layout.notes)
 
@@ -162,37 +161,16 @@ def _blocks(path: Path, offset: int) -> Iterator[bytes]:
             yield rest + b"\n"
 
 
-def _side_by_side(blocks: Iterator[bytes], work: Callable[[bytes], list[_Part]]) -> Iterator[list[_Part]]:
-    """Do the work on the blocks, a few at a time, and fetch (and decompress) the next ones meanwhile; results come in their order."""
-    workers = min(os.cpu_count() or 1, MOST_WORKERS)
-    with ThreadPoolExecutor(1, thread_name_prefix="gyrostab-fetch") as fetcher, ThreadPoolExecutor(workers) as pool:
-        waiting: deque[Future[list[_Part]]] = deque()
-        following = fetcher.submit(next, blocks, b"")
-        while block := following.result():
-            following = fetcher.submit(next, blocks, b"")
-            waiting.append(pool.submit(work, block))
-            if len(waiting) > workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-
-
 class _Part(NamedTuple):
-    """Rows of a block that were read in one way: their values and stamps, and the text, whose lines tell where a row stands."""
+    """Rows of a block that were read in one way, and the text, whose lines tell where a row stands."""
 
-    values: dict[int, NDArray[np.float64]]
-    stamps: NDArray[np.int64] | None
-    words: int
+    taken: Taken
     lines: int
     block: bytes
     span: slice
 
-    @property
-    def rows(self) -> int:
-        return len(next(iter(self.values.values()))) if self.values else len(self.stamps) if self.stamps is not None else 0
 
-
-def _take(block: bytes, typing: Typing) -> list[_Part]:
+def _take(block: bytes, typing: Typing, intake: Intake) -> list[_Part]:
     """Read one block."""
     parts: list[_Part] = []
     start, reach, left = 0, LINE_BYTES, _lines(block, slice(None))
@@ -200,13 +178,13 @@ def _take(block: bytes, typing: Typing) -> list[_Part]:
         (values, stamps), stop = parse_plain(block, start, left, typing)
         if stop > start:
             lines = left if stop == len(block) else _lines(block, slice(start, stop))
-            parts.append(_Part(values, stamps, 0, lines, block, slice(start, stop)))
+            parts.append(_Part(intake.prepare(values, stamps), lines, block, slice(start, stop)))
             left -= lines
         if stop == len(block):
             break
         reach = LINE_BYTES if stop - start > PIECE_BYTES else min(4 * reach, PIECE_BYTES)
         start = block.find(b"\n", min(stop + reach, len(block) - 1)) + 1
-        parts.append(_take_piece(_tidy(block[stop:start], typing.layout.separator), typing))
+        parts.append(_take_piece(_tidy(block[stop:start], typing.layout.separator), typing, intake))
         left -= parts[-1].lines
     return parts
 
@@ -215,20 +193,24 @@ def _lines(block: bytes, span: slice) -> int:
     return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8)[span] == 10))
 
 
-def _take_piece(piece: bytes, typing: Typing) -> _Part:
+def _take_piece(piece: bytes, typing: Typing, intake: Intake) -> _Part:
     """Read rows of which one at least is not plain."""
     lines = piece.count(b"\n")
     parsed = parse_fast(piece, typing) if len(piece) > SHORT_BYTES else None
     if parsed is not None:
-        part = _Part(*parsed, 0, lines, piece, slice(None))
-        if part.rows == lines or b'"' not in piece or part.rows == sum(1 for text in piece.split(b"\n") if text.strip()):
-            return part  # otherwise a stray quote has swallowed line ends
+        rows = _rows(*parsed)
+        if rows == lines or b'"' not in piece or rows == sum(1 for text in piece.split(b"\n") if text.strip()):
+            return _Part(intake.prepare(*parsed), lines, piece, slice(None))  # otherwise a stray quote has swallowed line ends
     values, stamps, words = parse_cells(piece, typing)
-    return _Part(values, stamps, words, lines, piece, slice(None))
+    return _Part(intake.prepare(values, stamps, words=words), lines, piece, slice(None))
+
+
+def _rows(values: dict[int, NDArray[np.float64]], stamps: NDArray[np.int64] | None) -> int:
+    return len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
 
 
 def _line_names(part: _Part, first: int, rows: Sequence[int]) -> list[str]:
-    if part.rows == part.lines:
+    if part.taken.rows == part.lines:
         return [f"line {first + row}" for row in rows]
     tidy = _tidy(part.block[part.span], ",")
     filled = [number for number, text in enumerate(tidy.split(b"\n"), first) if text.strip()]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import TimeError
 from gyrostab.kernels.stamps import NO_STAMP, piece_sums, track
 from gyrostab.regularise.steps import cut, finer_period, refined
+from gyrostab.threads import in_order
 
 __all__ = ["RateEstimate", "Stamps", "estimate_near", "estimate_rate", "odd_stretches", "starting_period"]
 
@@ -206,26 +207,36 @@ def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest:
     """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
     table = np.empty((0, 6))
     zero: int | None = None
-    for _, block in stamps():
-        rows, block = block, _readable(block)
-        if len(block) == 0:
+    for first, sums in in_order(partial(_piece_sums, period=period, counted=counted, coarse=coarse, longest=longest), stamps()):
+        if first is None:
             continue
-        zero = int(block[0]) if zero is None else zero
-        if counted:
-            known = np.flatnonzero(rows != NO_STAMP)
-            piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
-            count = known  # a row counts, with or without a stamp
-        else:
-            count, piece = track(block, period, _GAIN, longest)
-        if coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1:  # only there the true time is known
-            block, count, piece = block[tick], count[tick], piece[tick]
-        sums = piece_sums(block, count, piece, period)
-        sums[:, 2] += block[0] - zero if len(block) else 0
+        zero = first[0] if zero is None else zero
+        sums[:, 2] += first[1] - zero
         table = np.concatenate([table, sums])
         if len(table) > _MAX_PIECES:  # a log in shreds: the largest pieces tell the rate
             table = table[np.argsort(-table[:, 3], kind="stable")[: _MAX_PIECES // 2]]
             table = table[np.argsort(table[:, 2], kind="stable")]
     return table
+
+
+def _piece_sums(
+    found: tuple[NDArray[np.int64], NDArray[np.int64]], *, period: float, counted: bool, coarse: bool, longest: float
+) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
+    """Of one block: its first stamp, that from which the sums count, and the sums of its pieces; None where no stamp is readable."""
+    rows, block = found
+    block = _readable(block)
+    if len(block) == 0:
+        return None, np.empty((0, 6))
+    first = int(block[0])
+    if counted:
+        known = np.flatnonzero(rows != NO_STAMP)
+        piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
+        count = known  # a row counts, with or without a stamp
+    else:
+        count, piece = track(block, period, _GAIN, longest)
+    if coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1:  # only there the true time is known
+        block, count, piece = block[tick], count[tick], piece[tick]
+    return (first, int(block[0])), piece_sums(block, count, piece, period)
 
 
 def _pooled(pieces: NDArray[np.float64], period: float, counted: bool) -> tuple[float, float, float]:
@@ -368,9 +379,14 @@ def odd_stretches(stamps: Stamps, period: float, *, size: int = 1024) -> list[tu
     for rows, values in _recut(stamps, 64 * size):
         known = values != NO_STAMP
         rows, values = rows[known], values[known]
-        for begin, pace in _paces(values, size):
+        begins, paces = _paces(values, size)
+        far = np.abs(paces / period - 1) >= 0.02
+        if not far.any():
+            inside = False if len(far) else inside
+            continue
+        for begin, look in zip(begins.tolist(), far.tolist(), strict=True):
             part = values[begin : begin + size]
-            own = None if abs(pace / period - 1) < 0.02 else _on_a_line([part])
+            own = _on_a_line([part]) if look else None
             odd = own is not None and abs(own / period - 1) > 0.02
             if odd and not inside and own is not None:
                 found.append((int(rows[begin]), int(part[0]), SECOND / own))
@@ -378,11 +394,13 @@ def odd_stretches(stamps: Stamps, period: float, *, size: int = 1024) -> list[tu
     return found
 
 
-def _paces(values: NDArray[np.int64], size: int) -> Iterator[tuple[int, float]]:
+def _paces(values: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """First row of every stretch of `size` stamps (the last may be shorter), and how far apart its stamps are as a rule [ns]."""
     whole = len(values) // size
     table = np.diff(values[: whole * size].reshape(whole, size)[:, ::16], axis=1)
     paces = np.median(table, axis=1) / 16 if whole else np.empty(0)
-    yield from ((place * size, float(pace)) for place, pace in enumerate(paces))
+    begins = np.arange(whole) * size
     if len(values) - whole * size >= size // 4:
-        yield whole * size, float(np.median(np.diff(values[whole * size :: 16]))) / 16
+        last = np.median(np.diff(values[whole * size :: 16])) / 16
+        begins, paces = np.append(begins, whole * size), np.append(paces, last)
+    return begins, paces

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -14,6 +16,7 @@ from gyrostab.errors import FormatError
 from gyrostab.kernels.stamps import look
 from gyrostab.schema import texts
 from gyrostab.store.direct import stretch
+from gyrostab.threads import in_order
 
 __all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
 
@@ -80,6 +83,32 @@ def _join(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
 
 
+class _Seen(NamedTuple):
+    """What `survey` finds in one block."""
+
+    absent: int
+    bits: NDArray[np.uint8]
+    unreadable: NDArray[np.int64]
+    infinite: NDArray[np.int64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    filled: list[int]
+
+
+def _look_at(raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]) -> _Seen:
+    begin, end = ends
+    cells = stretch(raw[name].data, begin, end)
+    present = np.empty(end - begin, dtype=bool)
+    missing, holes, infinities, low, high = look(np.ascontiguousarray(cells, dtype=np.float64), present)
+    unreadable = _spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NONE
+    infinite = _spans(np.isinf(cells).any(axis=0), begin) if infinities else _NONE
+    filled = [int(np.isfinite(stretch(raw[key].data, begin, end)).sum()) for key in channels]
+    return _Seen(missing, np.packbits(present), unreadable, infinite, low, high, filled)
+
+
+_NONE = np.empty((0, 2), dtype=np.int64)
+
+
 def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
     """Look at every cell of a raw log once.
 
@@ -96,20 +125,15 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
     low, high = np.full(n_axes, np.inf), np.full(n_axes, -np.inf)
     channels = [str(key) for key, variable in raw.data_vars.items() if variable.dims == ("row",)]
     filled = dict.fromkeys(channels, 0)
-    for begin in range(0, rows, block):
-        end = min(rows, begin + block)
-        cells = stretch(signal, begin, end)
-        present = np.empty(end - begin, dtype=bool)
-        missing, holes, infinities, least, most = look(np.ascontiguousarray(cells, dtype=np.float64), present)
-        absent += missing
-        bits.append(np.packbits(present))
-        if holes:
-            unreadable.append(_spans(np.isnan(cells).any(axis=0) & present, begin))
-        if infinities:
-            infinite.append(_spans(np.isinf(cells).any(axis=0), begin))
-        low, high = np.minimum(low, least), np.maximum(high, most)
-        for key in channels:
-            filled[key] += int(np.isfinite(stretch(raw[key].data, begin, end)).sum())
+    work = partial(_look_at, raw, name, channels)
+    for one in in_order(work, ((begin, min(rows, begin + block)) for begin in range(0, rows, block))):
+        absent += one.absent
+        bits.append(one.bits)
+        unreadable.append(one.unreadable)
+        infinite.append(one.infinite)
+        low, high = np.minimum(low, one.low), np.maximum(high, one.high)
+        for key, count in zip(channels, one.filled, strict=True):
+            filled[key] += count
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
             f"{_sources(raw)}: none of the {rows} rows holds a number for any gyro axis; check the columns, the units and --map"
@@ -123,7 +147,15 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
 def blocks(
     raw: xr.Dataset, found: Survey, *, block: int = BLOCK, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Row numbers and stamps [ns, `NO_STAMP` where unreadable] of the rows that hold a sample, block by block."""
+    """Row numbers and stamps [ns, `NO_STAMP` where unreadable] of the rows that hold a sample, block by block, fetched ahead."""
+    return in_order(_same, _blocks(raw, found, block, all_rows=all_rows), workers=1)
+
+
+def _same(block: tuple[NDArray[np.int64], NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return block
+
+
+def _blocks(raw: xr.Dataset, found: Survey, block: int, *, all_rows: bool) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     stamps = raw["time"].data
     for begin in range(0, found.rows, block):
         end = min(found.rows, begin + block)

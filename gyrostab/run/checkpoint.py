@@ -166,17 +166,28 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
     first = blocks[0].header
     small = sum(block.path.stat().st_size for block in blocks) <= _SMALL
     variables: dict[str, xr.Variable] = {}
+    maps = [np.memmap(block.path, mode="r") for block in blocks] if small else []
     for name, described in first["variables"].items():
         dims, attrs = tuple(described["dims"]), _from_json(described["attrs"])
         if "time" not in dims:
             data = _section(blocks[0], name)
-        elif small or name in first["coords"]:
+        elif small:
+            data = np.concatenate([_part(mapped, block, name) for mapped, block in zip(maps, blocks, strict=True)], axis=dims.index("time"))
+        elif name in first["coords"]:
             data = np.concatenate([_section(block, name) for block in blocks], axis=dims.index("time"))
         else:
             data = _lazily(blocks, name)
         variables[name] = xr.Variable(dims, data, attrs)
     whole = xr.Dataset(variables, attrs=_from_json(first["attrs"]))
     return whole.set_coords(first["coords"])
+
+
+def _part(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
+    """One variable of a block that is mapped as a whole."""
+    described = block.header["variables"][name]
+    dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
+    begin = block.begin + described["place"]
+    return np.asarray(mapped[begin : begin + int(np.prod(shape)) * dtype.itemsize].view(dtype).reshape(shape))
 
 
 def _section(block: Block, name: str) -> NDArray[Any]:

@@ -22,6 +22,7 @@ __all__ = ["Blocks", "compute_blocks", "compute_part", "share_constant", "write_
 #: Finished parts by their number.
 Blocks = dict[int, Block]
 _HELD_SECONDS, _HELD_BYTES = 1.0, 2**26  # results wait so long at most until the inputs are looked at again
+_LOOKS = 50  # and no longer than so many of the looks take: what has been written need not be at the end
 
 
 def compute_part(log: xr.Dataset, part: slice, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None) -> xr.Dataset:
@@ -66,12 +67,14 @@ def compute_blocks(
     """
     missing = [number for number in range(len(parts)) if number not in blocks]
     held: list[tuple[int, xr.Dataset]] = []
-    last = time.monotonic()
+    last, look = time.monotonic(), 0.0
 
     def keep() -> None:
-        nonlocal last
+        nonlocal last, look
         if held:
+            begun = time.monotonic()
             check()
+            look = time.monotonic() - begun
         while held:
             number, result = held.pop()
             blocks[number] = write_block(folder, parts[number], result, job=job)
@@ -83,7 +86,7 @@ def compute_blocks(
     try:
         for done, result in in_any_order(pool, ((function, *arguments, parts[number]) for number in missing)):
             held.append((numbers[done[-1].start], result))
-            if time.monotonic() - last > _HELD_SECONDS or sum(one.nbytes for _, one in held) > _HELD_BYTES:
+            if time.monotonic() - last > min(_HELD_SECONDS, _LOOKS * look) or sum(one.nbytes for _, one in held) > _HELD_BYTES:
                 keep()
     except BaseException as error:
         if isinstance(error, Exception):
@@ -119,9 +122,13 @@ def write_blocks(blocks: Blocks, target: Path, *, attrs: Mapping[str, Any], over
             return results
         return dask.local.get_sync(dask.optimization.cull(tasks, [keys])[0], keys)
 
+    def share(written: float) -> None:
+        if variables:
+            stage("writing", variables, max(min(done, variables), int(written * variables)), "variables")
+
     stage("writing", variables, 0, "variables")
     with dask.config.set(scheduler=in_order):
-        to_netcdf(whole, target, overwrite=overwrite)
+        to_netcdf(whole, target, overwrite=overwrite, progress=share)
     return whole
 
 

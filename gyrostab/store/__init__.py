@@ -4,6 +4,7 @@ One chunk holds about 20 minutes of one axis. What a source delivered as integer
 gives back the same doubles. A chunk that is missing or damaged becomes a gap, and a warning says where; never does it in silence.
 """
 
+from gyrostab.store.deflate import append_deflated, large_variables
 from gyrostab.store.layout import stored_attribute
 from gyrostab.store.read import open_stored
 from gyrostab.store.write import Misfit, Progress, append_netcdf, append_zarr, as_counts, chunk_samples, common_packing, long_variables
@@ -11,11 +12,13 @@ from gyrostab.store.write import Misfit, Progress, append_netcdf, append_zarr, a
 __all__ = [
     "Misfit",
     "Progress",
+    "append_deflated",
     "append_netcdf",
     "append_zarr",
     "as_counts",
     "chunk_samples",
     "common_packing",
+    "large_variables",
     "long_variables",
     "open_stored",
     "stored_attribute",

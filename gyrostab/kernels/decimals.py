@@ -1,0 +1,167 @@
+"""Columns in less room: decimals as whole numbers of 32 bits, stamps as stretches of even steps; both back bit for bit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import KERNEL
+
+__all__ = ["decimals_of", "even_steps", "from_decimals", "to_decimals", "unroll_steps"]
+
+#: Stands for a value that is missing.
+_FILL = np.int32(np.iinfo(np.int32).min)
+_LARGEST = float(np.iinfo(np.int32).max)
+_STRETCH = 4096
+_MOST_DECIMALS = 9
+_LOOKED_AT = 256
+
+
+@njit(**KERNEL)
+def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
+    """Whole numbers of which division by a power of ten makes the very same values, if there are such.
+
+    Parameters
+    ----------
+    values : float64 (n,)
+        Values; what is not finite is missing.
+    tens : float
+        The power of ten.
+    counts : int32 (n,)
+        Overwritten.
+
+    Returns
+    -------
+    fits : bool
+        False when a value is no such decimal, or a zero below zero; the rest then says nothing.
+    missing : int
+        Values that are not finite.
+    low, high : float
+        Range of the others; infinite without any.
+    whole : bool
+        Whether the others are whole numbers.
+    """
+    n = values.size
+    missing, smallest, largest, all_whole = np.int64(0), np.int32(2147483647), np.int32(-2147483647), True
+    for begin in range(0, n, _STRETCH):
+        off, absent, odd = np.int64(0), np.int64(0), np.int64(0)
+        for i in range(begin, min(begin + _STRETCH, n)):
+            value = values[i]
+            finite = value - value == 0.0
+            near = np.rint(value * tens)
+            inside = abs(near) < _LARGEST
+            count = np.int32(near) if finite and inside else _FILL
+            back = np.float64(count) / tens
+            same = back == value and (count != 0 or math.copysign(1.0, value) > 0.0)
+            off += finite and not same
+            absent += not finite
+            odd += finite and np.rint(value) != value
+            smallest = min(smallest, count if finite else np.int32(2147483647))
+            largest = max(largest, count)
+            counts[i] = count
+        missing += absent
+        all_whole = all_whole and odd == 0
+        if off:
+            return False, missing, 0.0, 0.0, False
+    if missing == n:
+        return True, missing, np.inf, -np.inf, True
+    return True, missing, smallest / tens, largest / tens, all_whole
+
+
+@njit(**KERNEL)
+def from_decimals(counts, tens, factor, offset, values):  # type: ignore[no-untyped-def]
+    """The values that `to_decimals` took, times a factor, plus an offset (where these are not 1 and 0); NaN where missing.
+
+    Parameters
+    ----------
+    counts : int32 (n,)
+    tens, factor, offset : float
+    values : float64 (n,)
+        Overwritten.
+    """
+    same = factor == 1.0 and offset == 0.0
+    if tens == 1.0:
+        for i in range(counts.size):
+            value = np.float64(counts[i])
+            values[i] = np.nan if counts[i] == _FILL else value * factor + offset
+        return
+    for i in range(counts.size):
+        value = np.float64(counts[i]) / tens
+        value = value if same else value * factor + offset
+        values[i] = np.nan if counts[i] == _FILL else value
+
+
+def decimals_of(values: NDArray[np.float64]) -> float:
+    """The least power of ten with which the first values are whole numbers, as far as a double can tell; 0 where there is none.
+
+    Examples
+    --------
+    >>> decimals_of(np.array([1.25, np.nan, -3.0])), decimals_of(np.array([np.pi]))
+    (100.0, 0.0)
+    """
+    some = np.ascontiguousarray(values[np.isfinite(values)][:_LOOKED_AT])
+    counts = np.empty(some.size, np.int32)
+    return next((10.0**n for n in range(_MOST_DECIMALS + 1) if to_decimals(some, 10.0**n, counts)[0]), 0.0)
+
+
+@njit(**KERNEL)
+def _count_steps(stamps):  # type: ignore[no-untyped-def]
+    """How often the step from one stamp to the next changes."""
+    changes = np.int64(0)
+    for i in range(2, stamps.size):
+        changes += stamps[i] - stamps[i - 1] != stamps[i - 1] - stamps[i - 2]
+    return changes
+
+
+@njit(**KERNEL)
+def _find_steps(stamps, table):  # type: ignore[no-untyped-def]
+    """Fill the table of `even_steps`; returns its length."""
+    n, row = np.int64(0), np.int64(0)
+    while row < stamps.size:
+        step = stamps[row + 1] - stamps[row] if row + 1 < stamps.size else np.int64(0)
+        table[n, 0], table[n, 1], table[n, 2] = row, stamps[row], step
+        n += 1
+        row += 1
+        while row < stamps.size and stamps[row] - stamps[row - 1] == step:
+            row += 1
+    return n
+
+
+def even_steps(stamps: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Stretches of stamps at even steps: first row, its stamp, and step of each, shape (n, 3); None where they would take more room.
+
+    Examples
+    --------
+    >>> even_steps(np.array([*range(0, 500, 5), *range(900, 1400, 5)]))
+    array([[  0,   0,   5],
+           [100, 900,   5]])
+    """
+    most = _count_steps(stamps) + 2
+    if 3 * most > max(stamps.size // 8, 12):
+        return None
+    table = np.empty((most, 3), np.int64)
+    return table[: _find_steps(stamps, table)].copy()
+
+
+@njit(**KERNEL)
+def unroll_steps(table, begin, stamps):  # type: ignore[no-untyped-def]
+    """The stamps from row `begin` on that `even_steps` made the table of.
+
+    Parameters
+    ----------
+    table : int64 (n, 3)
+    begin : int
+    stamps : int64 (m,)
+        Overwritten.
+    """
+    n = np.searchsorted(table[:, 0], begin, side="right") - 1
+    row, end = np.int64(begin), begin + stamps.size
+    while row < end:
+        stop = min(end, table[n + 1, 0]) if n + 1 < len(table) else end
+        first, step = table[n, 1] - table[n, 0] * table[n, 2], table[n, 2]
+        for i in range(row, stop):
+            stamps[i - begin] = first + i * step
+        row, n = stop, n + 1

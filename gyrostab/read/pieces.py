@@ -1,0 +1,279 @@
+"""Columns of 8-byte values in pieces, packed where that loses nothing, in memory or in an unlinked temporary file.
+
+Files are read back with `os.preadv`, not mapped: pages of a mapped file would count as memory of this process, more and more of them
+as a long log is gone through, and every map holds a file handle of its own, of which hundreds of files would need thousands.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import IO, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.errors import OutputError
+
+__all__ = ["Counts", "Piece", "Pieces", "Spool", "Steps", "Words"]
+
+
+class Spool:
+    """A temporary file without a name, which the system removes with the last reference to it."""
+
+    def __init__(self) -> None:
+        self.file: IO[bytes] | None = None
+        self.end = 0
+        self._lock = threading.Lock()
+
+    def add(self, values: NDArray[Any]) -> int:
+        """Append an array; the byte at which it begins."""
+        try:
+            with self._lock:
+                if self.file is None:
+                    self.file = tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)  # noqa: SIM115
+                _write_all(self.file, values.data.cast("B"))
+                begin, self.end = self.end, self.end + values.nbytes
+                return begin
+        except OSError as error:
+            where = tempfile.gettempdir()
+            raise OutputError(
+                f"{where}: the columns of a long log are kept there while it is read, and cannot be written ({error.strerror}); "
+                "make room, or name a larger place in the environment variable TMPDIR"
+            ) from error
+
+    def store(self, values: NDArray[Any]) -> Pieces:
+        """Move a column to the file."""
+        pieces = Pieces(values.dtype, [Words(np.ascontiguousarray(values).view(np.int64))])
+        pieces.spill(self)
+        return pieces
+
+    @property
+    def handle(self) -> int:
+        """Number of the open file."""
+        assert self.file is not None
+        return self.file.fileno()
+
+
+def _write_all(file: IO[bytes], view: memoryview) -> None:
+    while view.nbytes:
+        view = view[file.write(view) :]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """An array in a spool."""
+
+    spool: Spool
+    begin: int
+    size: int
+    dtype: np.dtype[Any]
+
+    def read(self, first: int, out: NDArray[Any]) -> None:
+        """Its values from number `first` on."""
+        wide, done = self.dtype.itemsize, 0
+        view = out.data.cast("B")
+        while done < view.nbytes:
+            got = os.preadv(self.spool.handle, [view[done:]], self.begin + wide * first + done)
+            if got < 1:
+                raise OSError("the temporary file of a long log is shorter than it was")
+            done += got
+
+    def write(self, number: int, value: int) -> None:
+        """Change one value."""
+        os.pwrite(self.spool.handle, np.array(value, self.dtype).tobytes(), self.begin + self.dtype.itemsize * number)
+
+
+_Kept = NDArray[Any] | _Place
+
+
+def _held(kept: _Kept) -> int:
+    return kept.nbytes if isinstance(kept, np.ndarray) else 0
+
+
+def _spilled(kept: _Kept, spool: Spool) -> _Kept:
+    return _Place(spool, spool.add(kept), kept.size, kept.dtype) if isinstance(kept, np.ndarray) and kept.size else kept
+
+
+def _part(kept: _Kept, first: int, size: int) -> NDArray[Any]:
+    if isinstance(kept, np.ndarray):
+        return kept[first : first + size]
+    out = np.empty(size, kept.dtype)
+    kept.read(first, out)
+    return out
+
+
+class Piece(Protocol):
+    """Some rows of a column."""
+
+    @property
+    def rows(self) -> int:
+        """How many."""
+
+    @property
+    def held(self) -> int:
+        """Bytes in memory."""
+
+    def fill(self, first: int, out: NDArray[Any]) -> None:
+        """Put the values from row `first` on into `out`."""
+
+    def spilled(self, spool: Spool) -> Piece:
+        """The same with its values in a spool."""
+
+    def put(self, row: int, value: int) -> Piece:
+        """The same with another value in one row, by its bits."""
+
+
+@dataclass(frozen=True)
+class Words:
+    """Values as they are, by their bits."""
+
+    words: _Kept  # int64
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return self.words.size
+
+    @property
+    def held(self) -> int:
+        """Bytes in memory."""
+        return _held(self.words)
+
+    def fill(self, first: int, out: NDArray[Any]) -> None:
+        """Put the values from row `first` on into `out`."""
+        target = out.view(np.int64)
+        if isinstance(self.words, np.ndarray):
+            target[:] = self.words[first : first + out.size]
+        else:
+            self.words.read(first, target)
+
+    def spilled(self, spool: Spool) -> Piece:
+        """The same with its values in a spool."""
+        return Words(_spilled(self.words, spool))
+
+    def put(self, row: int, value: int) -> Piece:
+        """The same with another value in one row, by its bits."""
+        if isinstance(self.words, np.ndarray):
+            self.words[row] = value
+        else:
+            self.words.write(row, value)
+        return self
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Decimals as whole numbers of 32 bits (`gyrostab.kernels.decimals`), to be converted to another unit as they are read."""
+
+    counts: _Kept  # int32
+    tens: float
+    factor: float
+    offset: float
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return self.counts.size
+
+    @property
+    def held(self) -> int:
+        """Bytes in memory."""
+        return _held(self.counts)
+
+    def fill(self, first: int, out: NDArray[Any]) -> None:
+        """Put the values from row `first` on into `out`."""
+        from gyrostab.kernels.decimals import from_decimals
+
+        from_decimals(_part(self.counts, first, out.size), self.tens, self.factor, self.offset, out)
+
+    def spilled(self, spool: Spool) -> Piece:
+        """The same with its values in a spool."""
+        return Counts(_spilled(self.counts, spool), self.tens, self.factor, self.offset)
+
+    def put(self, row: int, value: int) -> Piece:
+        """The same with another value in one row, by its bits."""
+        return _unpacked(self, np.float64).put(row, value)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Stamps in stretches of even steps; so few numbers that they stay in memory."""
+
+    table: NDArray[np.int64]
+    rows: int
+
+    @property
+    def held(self) -> int:
+        """Bytes in memory."""
+        return self.table.nbytes
+
+    def fill(self, first: int, out: NDArray[Any]) -> None:
+        """Put the values from row `first` on into `out`."""
+        from gyrostab.kernels.decimals import unroll_steps
+
+        unroll_steps(self.table, first, out.view(np.int64))
+
+    def spilled(self, spool: Spool) -> Piece:
+        """The same with its values in a spool."""
+        return self
+
+    def put(self, row: int, value: int) -> Piece:
+        """The same with another value in one row, by its bits."""
+        return _unpacked(self, np.int64).put(row, value)
+
+
+def _unpacked(piece: Piece, dtype: Any) -> Words:
+    values = np.empty(piece.rows, dtype)
+    piece.fill(0, values)
+    return Words(values.view(np.int64))
+
+
+class Pieces:
+    """A column, behind the few attributes that dask asks for; dask copies whatever has a ``copy``."""
+
+    ndim = 1
+
+    def __init__(self, dtype: Any, pieces: Sequence[Piece]):
+        self.dtype = np.dtype(dtype)
+        self._pieces = [piece for piece in pieces if piece.rows]
+        self._rows = np.cumsum([0, *(piece.rows for piece in self._pieces)]).tolist()  # at which the pieces begin, and the end of the last
+        self.shape = (self._rows[-1],)
+
+    def view(self, dtype: Any) -> Pieces:
+        """The same bytes as another type; what spills or changes the one does so to the other."""
+        same = Pieces(dtype, ())
+        same._pieces, same._rows, same.shape = self._pieces, self._rows, self.shape
+        return same
+
+    @property
+    def held(self) -> int:
+        """Bytes in memory."""
+        return sum(piece.held for piece in self._pieces)
+
+    def spill(self, spool: Spool) -> None:
+        """Move what is in memory to a file."""
+        self._pieces[:] = [piece.spilled(spool) for piece in self._pieces]
+
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        rows = range(*(part[0] if isinstance(part, tuple) else part).indices(self.shape[0]))
+        out = np.empty(max(rows.stop - rows.start, 0), dtype=self.dtype)
+        self.fill(0, rows.start, out)
+        return out[:: rows.step]
+
+    def fill(self, _row: int, begin: int, out: NDArray[Any]) -> None:
+        """The values from row `begin` of the log on: `gyrostab.store.direct.Fill`."""
+        done, number = 0, bisect_right(self._rows, begin) - 1
+        while done < out.size:
+            first = begin + done - self._rows[number]
+            part = out[done : done + self._pieces[number].rows - first]
+            self._pieces[number].fill(first, part)
+            done, number = done + part.size, number + 1
+
+    def put(self, row: int, value: int) -> None:
+        """Change a value, by its bits."""
+        number = bisect_right(self._rows, row) - 1
+        self._pieces[number] = self._pieces[number].put(row - self._rows[number], value)

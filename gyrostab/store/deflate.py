@@ -1,0 +1,107 @@
+"""Large variables of a product into a NetCDF file: the library compresses one chunk after the other, here several threads do."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Mapping
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.store.lock import library_lock
+from gyrostab.store.write import Progress
+from gyrostab.threads import in_order
+
+__all__ = ["append_deflated", "large_variables"]
+
+#: Values from which the chunks of a variable are compressed side by side.
+_LARGE = 2**15
+
+
+def large_variables(stored: xr.Dataset, encoding: Mapping[Any, Mapping[str, Any]]) -> dict[str, xr.Variable]:
+    """Variables of numbers that are large enough for `append_deflated`."""
+    data = {str(name): array.variable for name, array in stored.data_vars.items() if array.size >= _LARGE and array.dtype.kind in "if"}
+    return {name: variable for name, variable in data.items() if encoding[name].get("zlib") and "_FillValue" not in variable.attrs}
+
+
+def append_deflated(
+    path: Path, large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]], *, progress: Progress | None = None
+) -> None:
+    """Add variables to a NetCDF file that holds the others, and their dimensions, already.
+
+    The file holds what the library would have written: bytes shuffled, then deflated.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    large : mapping of str to xarray.Variable
+        Of numbers, in memory or of dask; the latter are computed chunk by chunk.
+    encoding : mapping
+        For each of them ``zlib``, ``complevel``, ``shuffle``, ``chunksizes`` and ``_FillValue``, as for xarray.
+    progress : callable, optional
+        Told the share that is written.
+    """
+    import h5py
+    import netCDF4
+
+    if not large:
+        return
+    lock = library_lock()
+    with lock, netCDF4.Dataset(path, "a") as file:
+        for name, variable in large.items():
+            options = dict(encoding[name])
+            for dim, size in variable.sizes.items():
+                if dim not in file.dimensions:
+                    file.createDimension(str(dim), size)
+            made = file.createVariable(
+                name, variable.dtype, [str(dim) for dim in variable.dims], fill_value=options.pop("_FillValue"), **options
+            )
+            made.setncatts(variable.attrs)
+    total, done = sum(variable.size for variable in large.values()), 0
+    pieces = _pieces(large, encoding)
+    with lock:
+        target = h5py.File(path, "r+")
+    try:
+        for name, begin, size, packed in in_order(partial(_pack, large, encoding), pieces):
+            with lock:
+                target[name].id.write_direct_chunk(begin, packed)
+            done += size
+            if progress is not None:
+                progress(done / total)
+    finally:
+        with lock:
+            target.close()
+
+
+_Piece = tuple[str, tuple[int, ...]]
+
+
+def _pieces(large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]]) -> Iterator[_Piece]:
+    """Name and first place of every chunk."""
+    for name, variable in large.items():
+        steps = encoding[name]["chunksizes"]
+        yield from ((name, begin) for begin in product(*(range(0, size, step) for size, step in zip(variable.shape, steps, strict=True))))
+
+
+def _pack(
+    large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]], piece: _Piece
+) -> tuple[str, tuple[int, ...], int, bytes]:
+    """A chunk as it stands in the file, with its name, place and number of values."""
+    name, begin = piece
+    options, data = encoding[name], large[name].data
+    part = data[tuple(slice(first, first + step) for first, step in zip(begin, options["chunksizes"], strict=True))]
+    values: NDArray[Any] = part if isinstance(part, np.ndarray) else part.compute(scheduler="synchronous")
+    fill = options["_FillValue"]
+    chunk = np.full(options["chunksizes"], 0 if fill is None else fill, values.dtype)
+    inside = chunk[tuple(map(slice, values.shape))]
+    inside[...] = values
+    if fill is not None:
+        inside[np.isnan(values)] = fill
+    raw = chunk.reshape(-1).view(np.uint8).reshape(-1, chunk.itemsize)
+    return name, begin, values.size, zlib.compress(raw.T.tobytes(), options["complevel"])

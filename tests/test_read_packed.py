@@ -1,0 +1,194 @@
+"""Columns that are read are kept in less room than 8 bytes a value, and come back bit for bit."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab.kernels.decimals import decimals_of, even_steps, from_decimals, to_decimals, unroll_steps
+from gyrostab.kernels.stamps import NO_STAMP, new_state, place
+from gyrostab.read import buffers, files, read_log, text
+from gyrostab.read.combine import memory
+from gyrostab.read.pieces import Counts, Pieces, Spool, Steps, Words
+from gyrostab.threads import in_order
+
+
+def bits(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values).view(np.int64)
+
+
+@given(
+    st.lists(st.integers(-(2**31) + 2, 2**31 - 2), min_size=1, max_size=40),
+    st.integers(0, 9),
+    st.sampled_from([(1.0, 0.0), (0.02, 0.0), (1 / 3, 0.0), (1.8, 32.0)]),
+    st.sampled_from([None, np.nan, np.inf, -np.inf]),
+)
+@settings(max_examples=150, deadline=None)
+def test_decimals_come_back_as_a_parser_reads_them(wholes, digits, law, missing):
+    texts = [f"{'-' * (n < 0)}{abs(n) // 10**digits}.{abs(n) % 10**digits:0{digits}d}" if digits else str(n) for n in wholes]
+    values = np.array([float(text) for text in texts if float(text) or not text.startswith("-")] + ([] if missing is None else [missing]))
+    counts, (factor, offset) = np.empty(values.size, np.int32), law
+    fits, absent, low, high, whole = to_decimals(values, 10.0**digits, counts)
+    known = values[np.isfinite(values)]
+    assert fits
+    assert absent == values.size - known.size
+    assert whole == bool((known == np.rint(known)).all())
+    if known.size:
+        assert (low, high) == (known.min(), known.max())
+    back = np.empty(values.size)
+    from_decimals(counts, 10.0**digits, factor, offset, back)
+    wanted = np.where(np.isfinite(values), values, np.nan) * factor + offset
+    np.testing.assert_array_equal(bits(back[np.isfinite(values)]), bits(wanted[np.isfinite(values)]))
+    assert np.isnan(back[~np.isfinite(values)]).all()
+
+
+@pytest.mark.parametrize("odd", [1 / 3, -0.0, 2.0**31, np.nextafter(0.25, 1), 1e300])
+def test_what_is_no_decimal_of_32_bits_is_not_packed(odd):
+    values = np.array([1.0, odd, 2.5])
+    assert not to_decimals(values, 100.0, np.empty(3, np.int32))[0]
+    assert decimals_of(np.array([1.0, 2.5, np.nan])) == 10.0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 400))
+@settings(max_examples=60, deadline=None)
+def test_even_steps_come_back(seed, n):
+    rng = np.random.default_rng(seed)
+    steps = np.where(rng.random(n) < 0.005, rng.integers(-(10**12), 10**12, n), 2_500_000)
+    stamps = 1_767_225_600_000_000_000 + np.cumsum(steps)
+    stamps[rng.random(n) < 0.002] = NO_STAMP
+    table = even_steps(stamps)
+    if table is None:
+        assert n < 2000
+        return
+    for begin, end in [(0, n), (n // 3, n // 2), (n - 1, n)]:
+        out = np.empty(end - begin, np.int64)
+        unroll_steps(table, begin, out)
+        np.testing.assert_array_equal(out, stamps[begin:end])
+
+
+def test_uneven_steps_are_not_packed():
+    jitter = np.random.default_rng(0).integers(-50, 50, 5000)
+    assert even_steps(np.arange(5000) * 2_500_000 + jitter) is None
+    assert len(even_steps(np.arange(5000) * 2_500_000)) == 1
+
+
+@pytest.mark.parametrize("where", ["memory", "disk", "both"])
+def test_pieces_of_every_kind_in_memory_and_on_disk(where):
+    spool = Spool()
+    floats = np.array([0.5, np.nan, 1 / 3])
+    pieces = Pieces(np.float64, [Counts(np.array([15, -(2**31), 7], np.int32), 10.0, 3600.0, 1.0), Words(bits(floats))])
+    wanted = np.array([1.5 * 3600 + 1, np.nan, 0.7 * 3600 + 1, *floats])
+    stamps = np.array([5, 10, 15, 20, 100, 200])
+    times = Pieces("datetime64[ns]", [Steps(np.array([[0, 5, 5]]), 4), Words(stamps[4:].copy())])
+    if where == "both":
+        pieces._pieces[0] = pieces._pieces[0].spilled(spool)
+    if where == "disk":
+        held = pieces.held
+        pieces.spill(spool)
+        times.view(np.int64).spill(spool)  # a view is the same column
+        assert held == 12 + 24
+        assert pieces.held == 0
+        assert times.held == 24
+    for begin, end in [(0, 6), (2, 4), (3, 6), (5, 5)]:
+        np.testing.assert_array_equal(bits(pieces[begin:end]), bits(wanted[begin:end]))
+        np.testing.assert_array_equal(times[begin:end].view(np.int64), stamps[begin:end])
+    for row in (1, 5):
+        times.put(row, NO_STAMP)
+        stamps[row] = NO_STAMP
+    np.testing.assert_array_equal(times[:].view(np.int64), stamps)
+
+
+def text_log(path: Path, first: int, rows: int, *, decimals: int) -> Path:
+    rng = np.random.default_rng(first)
+    lines = ["time [ms],gyro_x [deg/h],gyro_y [0.02 deg/h],temperature [degC]"]
+    for n in range(rows):
+        x, y = rng.normal(scale=30), rng.integers(-500, 500)
+        temperature = f"{20 + n / 1000:.2f}" if n % 10 == 0 else ""
+        lines.append(f"{(first + n + 40 * (n > 700)) * 10},{x:.{decimals}f},{'****' if n == 333 else y},{temperature}")
+    lines[500] = "@@@@,,,"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("limit", [100, 10**9])
+@pytest.mark.parametrize("decimals", [3, 12])
+def test_a_log_that_is_packed_is_the_log(tmp_path, monkeypatch, limit, decimals):
+    paths = [text_log(tmp_path / f"{number}.csv", 1100 * number, 1000, decimals=decimals) for number in range(3)]
+    plain = read_log(paths)
+    assert isinstance(plain.rate.data, np.ndarray)
+    monkeypatch.setattr(buffers, "_SMALL", 0)
+    monkeypatch.setattr(files, "SPILL_BYTES", limit)
+    packed = read_log(paths)
+    assert packed.rate.chunks is not None
+    xr.testing.assert_identical(packed.compute(), plain)
+    np.testing.assert_array_equal(bits(packed.rate.compute().values), bits(plain.rate.values))
+
+
+def test_reading_ahead_ends_with_what_stops_it(tmp_path, monkeypatch):
+    paths = [text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)]
+    taken: list[int] = []
+    take = text._take
+
+    def slowly(block, **options):
+        time.sleep(0.005)
+        taken.append(len(block))
+        return take(block, **options)
+
+    def refuse(number, count, path):
+        if number == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(text, "_take", slowly)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 256)
+    with pytest.raises(KeyboardInterrupt):
+        read_log(paths, on_file=refuse)
+    assert sum(taken) < paths[0].stat().st_size / 3
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("gyrostab-")]
+
+
+def test_whole_numbers_at_even_steps_take_less_than_half_the_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(buffers, "_SMALL", 0)
+    path = text_log(tmp_path / "log.csv", 0, 3000, decimals=2)
+    assert memory(read_log(path)) < 0.55 * 8 * 4 * 3000
+
+
+def test_even_stamps_are_placed_as_those_that_are_not_quite():
+    """A nanosecond of jitter takes the rows another way through the kernel; more rows than it remembers samples of."""
+    rng = np.random.default_rng(5)
+    kept = np.sort(rng.choice(50_000, 49_900, replace=False))
+    rows = np.concatenate([kept[:30_000], kept[30_001:30_006], kept[30_000:30_001], kept[30_006:]])  # one row comes late
+    stamps = 7_000_000_000 + rows * 2_500_000
+    stamps[123] = NO_STAMP
+    found = []
+    for jitter in (0, 1):
+        state, ring = new_state()
+        shaken = np.where(stamps == NO_STAMP, stamps, stamps + jitter * (np.arange(stamps.size) % 3))
+        runs, events = place(np.arange(stamps.size), shaken, stamps.size, 2_500_000.0, 0.75, 1e9, state, ring)
+        found.append((runs, events[:, :3], state[:3], np.array(ring)))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert len(found[0][1]) == 1  # the late row
+    assert len(found[0][0]) > 90  # the gaps
+
+
+def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():
+    fetched: list[int] = []
+
+    def items():
+        for n in range(50):
+            fetched.append(n)
+            yield n
+
+    found = in_order(lambda n: n * n, items(), workers=2)
+    assert next(found) == 0
+    assert len(fetched) <= 5
+    assert list(found) == [n * n for n in range(1, 50)]
+    with pytest.raises(ZeroDivisionError):
+        list(in_order(lambda n: 1 / n, [2, 1, 0, 3]))
