@@ -54,7 +54,10 @@ _TAIL = 0.25
 _LEAST_P = 1e-12
 _FAST = 16  # samples of an instrument that is much faster than the log
 #: Generic -> view in which it is told.
-_GENERIC_VIEW = {"~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution"}
+_GENERIC_VIEW = {
+    "~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar", "~S(f)": "davar", "~cov": "cross_axis",
+    "~outliers": "distribution",
+}  # fmt: skip
 #: Where an effect shows -> view in which it is told.
 _PART_VIEW = {
     "mean": "mean", "wander": "mean", "levels": "mean", "power": "davar", "transfer": "davar", "cross": "cross_axis",

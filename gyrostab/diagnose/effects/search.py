@@ -164,7 +164,8 @@ def _means(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
         ]
         given = state.given.get(("mean", axis))
         beside = np.stack(given, axis=-1) if given else None
-        factors.append(mean_factors(data, state.baseline, designs, axis=axis, given=beside, folds=folds)[:, 1:])
+        known = {"given": beside, "folds": folds, "variance": state.mean_variance(axis)}
+        factors.append(mean_factors(data, state.baseline, designs, axis=axis, **known)[:, 1:])
     return _collect(group, [(axis,) for axis in state.axes], factors)
 
 

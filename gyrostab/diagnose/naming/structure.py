@@ -15,7 +15,7 @@ from gyrostab.diagnose.effects.search import hops_within
 from gyrostab.diagnose.gains.levels import level_gains
 from gyrostab.diagnose.naming.claims import Claim, Unknown
 from gyrostab.diagnose.naming.filters import on_all_axes
-from gyrostab.diagnose.naming.jumps import sudden
+from gyrostab.diagnose.naming.jumps import levels, stays, sudden
 from gyrostab.diagnose.naming.steady import always_there
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.physics.registry import effects
@@ -59,7 +59,8 @@ def without_pulses(chosen: Sequence[Claim | Unknown]) -> list[Claim | Unknown]:
 
 def possible(parts: Sequence[Part], state: State) -> list[Part]:
     """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not."""
-    return [part for part in parts if _possible(part, state)] if on_all_axes(parts, state) and sudden(parts, state) else []
+    whole = on_all_axes(parts, state) and sudden(parts, state) and stays(parts, state) and levels(parts, state)
+    return [part for part in parts if _possible(part, state)] if whole else []
 
 
 def plainer_effect(parts: Sequence[Part], state: State) -> str | None:
@@ -98,6 +99,8 @@ def _possible(part: Part, state: State) -> bool:
         return bool(np.abs(part_mixture(part, state).moments()[0]).max() <= LARGEST[effect])
     if view == "mean" and not _in_range(part, state):
         return False
+    if view == "power" and not _from_least(part, state):
+        return False
     if view == "levels" and _more_levels(part, state):
         return False
     if not always_there(part, state):
@@ -113,6 +116,19 @@ def _in_range(part: Part, state: State) -> bool:
     sizes, covariance = part_mixture(part, state).moments()
     least = np.abs(sizes) - _SURE * np.sqrt(np.diagonal(covariance))
     return all(size <= largest.get(name, np.inf) for name, size in zip(part.variant.columns, least, strict=True))
+
+
+def _from_least(part: Part, state: State) -> bool:
+    """Whether the size of a level of the noise lies above the least that the registry allows: what ages does not get better."""
+    from gyrostab.diagnose.effects.sizes import part_size
+
+    if part.variant.squared or len(part.variant.columns) != 1:
+        return True
+    least = {item.name: item.low for item in effects()[part.candidate.effect].parameters()}.get(part.variant.columns[0])
+    if least is None or not np.isfinite(least):
+        return True
+    size, error = part_size(part, state)
+    return size >= least - _SURE * error
 
 
 def _more_levels(part: Part, state: State) -> bool:

@@ -29,6 +29,7 @@ FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
 #: Pieces of a block over which the axes are averaged.
 PIECES = 16
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
+_BESIDE = (2, 6)  # turns in a block, from and below, beside those of the tool, where the noise about an order is measured
 _GAP_S = 1.0  # shorter gaps are not listed
 _FOR_LATTICE = 64  # blocks whose values are kept
 
@@ -77,6 +78,7 @@ class Accumulator:
         self.turn_carry: float | None = None
         self.turns = 0.0
         self.order = np.full((self.axes, blocks, len(HARMONICS)), np.nan + 0j) if self.turning else None
+        self.order_level = np.full(self.order.shape, np.nan) if self.order is not None else None
         self.ramp = self.beside.index("ramp") + self.axes if "ramp" in self.beside else None
         self.ramp_range = _range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
         if self.ramp_range[0] >= self.ramp_range[1]:
@@ -223,6 +225,7 @@ class Accumulator:
     def _orders(self, part: slice, centred: Array) -> None:
         assert self.turning is not None
         assert self.order is not None
+        assert self.order_level is not None
         index = np.arange(part.start * self.length, part.stop * self.length)
         rotation, self.turn_carry = channel_at(self.turning, grid_times(self.start, self.rate, index), self.turn_carry)
         inside = rotation * self.turning_factor / (360.0 * self.rate)
@@ -239,6 +242,21 @@ class Accumulator:
             with np.errstate(invalid="ignore", divide="ignore"):
                 value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
             self.order[:, part, number] = np.where(enough, value, np.nan)
+            level = _level_beside(centred, value, wheel, counts) / self.rate
+            self.order_level[:, part, number] = np.where(enough, level, np.nan)
+
+
+def _level_beside(centred: Array, value: NDArray[np.complex128], wheel: NDArray[np.complex128], counts: NDArray[np.int64]) -> Array:
+    """Mean power of what turns a few turns in the block more or less than a wheel (block, sample), per sample, (axis, block).
+
+    The wave that turns with the wheel itself, of the amplitude `value` (axis, block), is taken off, for its mirror image may be near.
+    """
+    present = centred != 0.0  # missing samples count as zero
+    left = centred - np.where(present, (value[..., None] * np.conj(wheel)).real, 0.0)
+    lines = np.fft.fft(left * wheel, axis=-1)
+    beside = np.concatenate([lines[..., _BESIDE[0] : _BESIDE[1]], lines[..., -_BESIDE[1] + 1 : -_BESIDE[0] + 1]], axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((np.abs(beside) ** 2).mean(axis=-1) / counts)
 
 
 def _swap(found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:

@@ -110,7 +110,7 @@ def reduce_log(
         and of these ``stuck`` and ``filled``. By
         ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``,
         ``cross_shape`` (pair, block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
-        ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
+        ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order`` and ``order_level`` (axis, block, harmonic),
         ``profile(axis, block, phase)``, ``piece_mean`` and ``piece_samples`` (axis, block, inner), ``lattice(axis)``,
         ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects follow late, and the gaps and restarts in seconds.
         Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
@@ -291,6 +291,8 @@ def _locked(work: Accumulator) -> dict[str, Any]:
     if work.order is not None:
         attrs = _named("complex amplitude at multiples of the tool's rotation, NaN below one turn in the block", _RATE)
         found["order"] = (("axis", "block", "harmonic"), work.order, attrs)
+        level = _named("density of what turns 2 to 5 times in the block more or less than that, two-sided", _POWER)
+        found["order_level"] = (("axis", "block", "harmonic"), work.order_level, level)
     if work.profile_sums is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
             profile = work.profile_sums / work.profile_counts
