@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 _JUMP, _INSTANT = "bias_jump", "at"
 _BLOCKS = (4, 8)  # lengths of a transition that is no jump
 _BETTER, _FORM = 3.0, 0.01  # nats by which it must do better, and of what the jump gains
-_LENGTHS = 48  # of an event, at most
+_LENGTHS, _SHORT = 48, 0.1  # lengths of an event that are tried; of the record, that it lasts at most, but for eight blocks
 _LEAST_BESIDE = 3  # blocks before and behind an event, that tell the level there
 _LOUDER = (10.0, 100.0, 1e3, 1e4, 1e5)  # times the usual variance of the means
 _SURE = 3.0  # standard errors of the level after an event, from which on it is another than before
@@ -55,8 +55,8 @@ def sudden(parts: Sequence[Part], state: State) -> bool:
 def stays(parts: Sequence[Part], state: State) -> bool:
     """Whether the means stay on another level after jumps, rather than come back.
 
-    What lasts for a while, two blocks or more before or after the instant, and says more than a level that stays, on all
-    axes together, is an event that ends. It is none where the level behind it is another than the one before: then there are two jumps.
+    What lasts for two blocks to a tenth of the record before or after the instant, and says more than a level that stays, on all axes
+    together, is an event that ends. It is none where the level behind it is another than the one before: then there are two jumps.
 
     Parameters
     ----------
@@ -82,8 +82,9 @@ def stays(parts: Sequence[Part], state: State) -> bool:
 def levels(parts: Sequence[Part], state: State) -> bool:
     """Whether jumps lead to levels, and are not the wildest of means that scatter more for a while.
 
-    Waves slower than a block make means scatter, and of such means any two that follow each other are a jump. So the jumps must say something,
-    but for 3 nats of chance, where the white noise of the means may be louder for some stretch about the instant, with and without them.
+    Waves slower than a block make means scatter, and of such means any two that follow each other are a jump. So the jumps must say
+    something, but for 3 nats of chance, where the white noise of the means may be louder for some stretch about the instant, with and
+    without them.
 
     Parameters
     ----------
@@ -125,7 +126,7 @@ def _spans(part: Part, state: State) -> list[tuple[int, int]]:
     """First block and the one behind the last of events that begin or end at the instant of a jump, and at no end of the record."""
     block, blocks = float(state.reduced.attrs["block_s"]), state.reduced.sizes["block"]
     at = round(float(part.variant.values[_INSTANT]) / block)
-    lengths = np.unique(np.geomspace(2.0, max(blocks, 3), _LENGTHS).astype(int)).tolist()
+    lengths = np.unique(np.geomspace(2.0, max(_SHORT * blocks, 8.0), _LENGTHS).astype(int)).tolist()
     both = [span for length in lengths for span in ((at, at + length), (at - length, at))]
     return [(first, stop) for first, stop in both if first >= _LEAST_BESIDE and stop <= blocks - _LEAST_BESIDE]
 
