@@ -72,17 +72,6 @@ class State:
         given[view, row] = [*given.get((view, row), []), *columns]
         return replace(self, given=given)
 
-    def mean_variance(self, axis: str) -> Array:
-        """White variance of the block means of an axis (block,) [degree2 hour-2], more where what is in the model makes blocks louder.
-
-        A mean is what the spectrum has at its lower end: a block whose lowest band has so many times the power of the quietest one has
-        as many times its variance.
-        """
-        row = self.axes.index(axis)
-        quiet = self.baseline["mean_variance"].sel(axis=axis).values
-        louder = self.weight[row, :, 0] / self.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values[:, 0]
-        return np.asarray(quiet * (1.0 + louder - np.nanmin(louder)), dtype=np.float64)
-
     @property
     def axes(self) -> list[str]:
         """Names of the axes."""

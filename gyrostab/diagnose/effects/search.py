@@ -164,8 +164,7 @@ def _means(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
         ]
         given = state.given.get(("mean", axis))
         beside = np.stack(given, axis=-1) if given else None
-        known = {"given": beside, "folds": folds, "variance": state.mean_variance(axis)}
-        factors.append(mean_factors(data, state.baseline, designs, axis=axis, **known)[:, 1:])
+        factors.append(mean_factors(data, state.baseline, designs, axis=axis, given=beside, folds=folds)[:, 1:])
     return _collect(group, [(axis,) for axis in state.axes], factors)
 
 

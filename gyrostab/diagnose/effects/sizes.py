@@ -60,7 +60,7 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     tier : {"free", "calibrated"}
         What the noise may be, as in `gyrostab.diagnose.gains.gain.mean_factors`.
     variance : ndarray, shape (block,), optional
-        White variance of the means in place of that of the state [degree2 hour-2].
+        White variance of the means in place of that of the baseline [degree2 hour-2].
     """
     baseline = state.baseline
     row = state.axes.index(axis)
@@ -74,7 +74,7 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     products = mean_products(
         np.where(present, y, 0.0)[:, None],
         whole / size,
-        variance=state.mean_variance(axis) if variance is None else variance,
+        variance=baseline["mean_variance"].sel(axis=axis).values if variance is None else variance,
         step=float(state.reduced.attrs["block_s"]),
         present=present,
         wander=known_wander(baseline, axis),

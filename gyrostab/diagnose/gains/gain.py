@@ -89,7 +89,6 @@ def mean_factors(
     tier: Tier = "free",
     given: Array | None = None,
     folds: xr.DataArray | None = None,
-    variance: Array | None = None,
 ) -> Array:
     """Factors of designs in the block means.
 
@@ -109,8 +108,6 @@ def mean_factors(
         Columns that are in the model with and without the design (effects already named).
     folds : xarray.DataArray, optional
         From `fold_blocks`.
-    variance : ndarray, shape (block,), optional
-        White variance of the means in place of that of the baseline [degree2 hour-2].
 
     Returns
     -------
@@ -124,9 +121,8 @@ def mean_factors(
     own = columns.shape[1]
     columns = np.concatenate([columns, beside], axis=1)
     present = np.asarray(np.isfinite(values).all(axis=1))
-    white_variance = baseline["mean_variance"].sel(axis=axis).values if variance is None else variance
     frame: dict[str, Any] = {
-        "variance": np.asarray(white_variance, dtype=np.float64),
+        "variance": np.asarray(baseline["mean_variance"].sel(axis=axis).values, dtype=np.float64),
         "step": float(data["end"][0] - data["begin"][0]),
         "pairs": pairs_of(columns.shape[1], numbers, beside.shape[1]),
         "wander": known_wander(baseline, axis),

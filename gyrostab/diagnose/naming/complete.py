@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -48,8 +47,7 @@ def redness(state: State, axis: str, folds: xr.DataArray) -> float:
     span = state.reduced.sizes["block"] * float(state.reduced.attrs["block_s"])
     slow = state.baseline["grid_K"].sel(axis=axis).values ** 2 * span / HOUR + state.baseline["grid_B"].sel(axis=axis).values ** 2
     for tier in ("free", "calibrated"):
-        known: dict[str, Any] = {"given": beside, "folds": folds, "variance": state.mean_variance(axis)}
-        evidence.append(mean_factors(state.reduced, state.baseline, [], axis=axis, tier=tier, **known)[0, 0, 0])
+        evidence.append(mean_factors(state.reduced, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds)[0, 0, 0])
         strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))
     return float(evidence[0] - evidence[1]) if strength[0] > strength[1] else 0.0
 

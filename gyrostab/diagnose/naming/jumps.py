@@ -117,7 +117,7 @@ def _scatter(part: Part, state: State) -> list[Array]:
     at = round(float(part.variant.values[_INSTANT]) / float(state.reduced.attrs["block_s"]))
     lengths = [2**power for power in range(1, max(blocks, 2).bit_length())]
     spans = {(max(at - one, 0), min(at + two, blocks)) for length in lengths for one, two in ((length, length), (0, length), (length, 0))}
-    usual = state.mean_variance(axis)
+    usual = state.baseline["mean_variance"].sel(axis=axis).values
     inside = [(block >= first) & (block < stop) for first, stop in sorted(spans)]
     return [usual, *(np.where(here, factor * usual, usual) for here in inside for factor in _LOUDER)]
 

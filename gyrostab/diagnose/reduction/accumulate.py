@@ -30,6 +30,7 @@ FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
 PIECES = 16
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
 _BESIDE = (2, 6)  # turns in a block, from and below, beside those of the tool, where the noise about an order is measured
+_APART = 1.0  # turns in a block, that these are away from what was taken off
 _GAP_S = 1.0  # shorter gaps are not listed
 _FOR_LATTICE = 64  # blocks whose values are kept
 
@@ -232,31 +233,42 @@ class Accumulator:
         edges = np.cumsum(np.concatenate([[self.turns], inside]))
         self.turns = math.fmod(float(edges[-1]), 1.0)
         turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
-        turned = np.abs(np.diff(edges).reshape(turns.shape).sum(axis=-1)) >= 1.0
+        often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
+        turned = np.abs(often) >= 1.0
         counts = self.counts[: self.axes, part, 0]
         enough = turned & (counts >= max(_POWER_SHARE * self.length, 2))
-        one = np.exp(-2j * math.pi * turns)
-        wheel = np.ones_like(one)
-        for number in range(len(HARMONICS)):
-            wheel = wheel * one
-            with np.errstate(invalid="ignore", divide="ignore"):
+        wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
+        present, left = centred != 0.0, centred  # missing samples count as zero
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for number, wheel in enumerate(wheels):
                 value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
-            self.order[:, part, number] = np.where(enough, value, np.nan)
-            level = _level_beside(centred, value, wheel, counts) / self.rate
-            self.order_level[:, part, number] = np.where(enough, level, np.nan)
+                self.order[:, part, number] = np.where(enough, value, np.nan)
+                left = left - np.where(present, (value[..., None] * np.conj(wheel)).real, 0.0)
+            for number, wheel in enumerate(wheels):
+                level = _power_beside(left * wheel, often, HARMONICS[number]) / (counts * self.rate)
+                self.order_level[:, part, number] = np.where(enough, level, np.nan)
 
 
-def _level_beside(centred: Array, value: NDArray[np.complex128], wheel: NDArray[np.complex128], counts: NDArray[np.int64]) -> Array:
-    """Mean power of what turns a few turns in the block more or less than a wheel (block, sample), per sample, (axis, block).
+def _power_beside(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
+    """Mean power (axis, block) of what turns a few times in the block more or less than a harmonic, NaN where nothing tells it.
 
-    The wave that turns with the wheel itself, of the amplitude `value` (axis, block), is taken off, for its mirror image may be near.
+    Places at which the mean of the block or a harmonic was taken off, or would be seen in the mirror, do not count.
+
+    Parameters
+    ----------
+    turned : ndarray, shape (axis, block, sample)
+        Samples without the harmonics, by the wheel of this one.
+    often : ndarray, shape (block,)
+        Turns of the tool in the block, negative where it turns back.
+    harmonic : int
     """
-    present = centred != 0.0  # missing samples count as zero
-    left = centred - np.where(present, (value[..., None] * np.conj(wheel)).real, 0.0)
-    lines = np.fft.fft(left * wheel, axis=-1)
-    beside = np.concatenate([lines[..., _BESIDE[0] : _BESIDE[1]], lines[..., -_BESIDE[1] + 1 : -_BESIDE[0] + 1]], axis=-1)
+    beside = np.concatenate([-np.arange(*_BESIDE)[::-1], np.arange(*_BESIDE)])
+    power = np.abs(np.fft.fft(turned, axis=-1)[..., beside]) ** 2
+    place = np.abs(harmonic * often[:, None] + beside)
+    taken = np.abs(often)[:, None, None] * np.array([0, *HARMONICS])
+    free = (np.abs(place[..., None] - taken) >= _APART).all(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((np.abs(beside) ** 2).mean(axis=-1) / counts)
+        return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
 
 
 def _swap(found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
