@@ -5,12 +5,13 @@
 
 Every record is reduced and calibrated by itself, and its largest held-out gain over steps, trends, events, curves, bands and filters is
 ranked among null records drawn from its own calibration. The ranks must be uniform: a share of 1 % below 1 %. With --whole the
-diagnosis itself runs, and what it claims is counted. Prints a Markdown table.
+diagnosis itself runs, and what it claims is counted. Prints a Markdown table, and beside it each record in which something was found.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator
 
@@ -121,6 +122,9 @@ def whole(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
         told = gyrostab.diagnose(log, nulls=options.nulls, seed=seed)
         named += bool(told.effects)
         found += told.verdict != "no mismatch"
+        if told.verdict != "no mismatch":
+            boxes = "; ".join(f"{box['statement']} (p = {box['p_value']:.2g})" for box in told.mismatches)
+            print(f"record {seed}: {told.verdict}; {[one['name'] for one in told.effects]}; {boxes}", file=sys.stderr, flush=True)
     levels = np.linspace(0.0, 1.0, 10_001)
     bound = float(levels[binom.cdf(named, options.records, levels) >= 0.05].max())
     seconds = (time.monotonic() - begin) / options.records

@@ -13,6 +13,7 @@ from gyrostab.diagnose.gains.gain import mean_gains, power_gains
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.reduction.outliers import CHANCE
 from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.kernels.periodogram import band_covariance
 from gyrostab.simulate import simulate
 
 NOISE = {"Q": 0.05, "N": 0.003, "B": 0.004, "K": 0.02}
@@ -84,6 +85,17 @@ def test_neighbouring_bands_scatter_together_as_in_raw_logs(lost):
     beside = [np.mean([np.diagonal(share, apart).mean() for apart in (1, 2)]) for share in shares]
     assert beside[1] == pytest.approx(beside[0], abs=0.006)
     assert beside[0] > 0.01
+
+
+def test_lowest_bands_scatter_with_the_third_above_as_the_taper_says():
+    record = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute())
+    baseline = calibrate(record)
+    nulls = joined(list(null_records(record, baseline, count=400, rng=np.random.default_rng(2))))
+    left = nulls["power"].transpose("axis", "band", ...).values.reshape(record.sizes["axis"] * record.sizes["band"], -1)
+    shape = baseline["shape_alone"].isel(axis=0, block=5).values
+    share = band_covariance(int(record.attrs["block_samples"]))[0, 3] * np.sqrt(shape[0] * shape[3])
+    assert share == pytest.approx(0.018, abs=0.002)
+    assert np.corrcoef(left)[0, 3] == pytest.approx(share, abs=4.0 / np.sqrt(left.shape[1]))
 
 
 def test_rare_kurtoses_are_as_rare_as_in_samples():

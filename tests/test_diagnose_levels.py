@@ -10,8 +10,8 @@ from gyrostab.diagnose.effects.candidates import Candidate, Variant
 from gyrostab.diagnose.effects.cells import State
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.gains.levels import HOPS, level_courses, level_gains
-from gyrostab.diagnose.modelling.levels import level_sizes
-from gyrostab.diagnose.naming.levels import followed_first
+from gyrostab.diagnose.modelling.level_sizes import level_sizes
+from gyrostab.diagnose.naming.hopping import followed_first
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.simulate import simulate
 

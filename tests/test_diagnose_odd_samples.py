@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-
 import numpy as np
 import pytest
 
 from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.conclusion import conclude
 from gyrostab.diagnose.modelling.odd_power import with_odd_power
 from gyrostab.diagnose.modelling.predict import predicted
 from gyrostab.diagnose.modelling.recalibrate import recalibrate
@@ -21,7 +20,6 @@ from tests.named import nulls
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-core = importlib.import_module("gyrostab.diagnose.core")
 SCATTER = 0.5  # deg/h, of a sample
 
 
@@ -157,7 +155,7 @@ def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_power
     assert float(whole) == pytest.approx(float(reduced["power"].mean()), rel=0.4)
     assert float(clean["spectrum"].mean()) < 0.1 * float(whole)
     for lacking, known in (([fitted], []), ([], [fitted])):  # effects of the recording alone, or of the simulation too
-        surfaces = core._surfaces(reduced, core._Fit(found, clean, lacking, known), clean, clean)
+        surfaces = conclude._surfaces(reduced, conclude.Fit(found, clean, lacking, known), clean, clean)
         short = surfaces["avar"].isel(tau=0).mean(["axis", "window"])
         before, after = (float(short.sel(case=case) / short.sel(case="recording")) for case in ("before", "after"))
         assert after == pytest.approx(1.0, rel=0.4)

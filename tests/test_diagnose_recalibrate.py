@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.conclusion import conclude
 from gyrostab.diagnose.effects.candidates import effect_candidates
 from gyrostab.diagnose.effects.cells import begin_state
 from gyrostab.diagnose.effects.explained import Part, explain_away
@@ -22,7 +22,6 @@ from gyrostab.diagnose.naming.claims import Claim, Naming
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.simulate import simulate
 
-core = importlib.import_module("gyrostab.diagnose.core")
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 SHAKE = {"profile": "vibration", "points": [[0, 3.0], [850, 3.0], [851, 6.0], [1800, 6.0]]}
 
@@ -71,11 +70,11 @@ def test_vibration_at_two_levels_and_never_none(shaken):
 def test_a_diagnosis_tells_noise_and_effects_as_they_are_beside_each_other(shaken):
     """The first calibration has the vibration in its noise, and finds less of it than there is."""
     naming, baseline, after = shaken
-    fit = core._fitted_beside_their_noise(naming, baseline, first := fit_claims(naming, baseline))
+    fit = conclude.fitted_beside_their_noise(naming, baseline, first := fit_claims(naming, baseline))
     assert noise_of(fit.noise, "N")[0] == noise_of(after, "N")[0] < 1.2 * 0.003
     (size,) = fit.fitted[0].parameters.values()
     assert size.low < 0.002 < size.high
-    held = core._worth(naming.state.reduced, baseline, naming, first)
+    held = conclude.worth(naming.state.reduced, baseline, naming, first)
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.15)
 
 
@@ -91,7 +90,7 @@ def test_a_size_in_shares_of_the_noise_is_one_of_the_noise_beside_it():
     baseline = calibrate(reduced)
     naming = naming_of(reduced, baseline, "temperature_noise", "power", ("linear",))
     first = fit_claims(naming, baseline)
-    fit = core._fitted_beside_their_noise(naming, baseline, first)
+    fit = conclude.fitted_beside_their_noise(naming, baseline, first)
     assert first[0].parameters["linear"].high < 0.05
     growth = fit.fitted[0].parameters["linear"].value * noise_of(fit.noise, "N")[0] ** 2
     assert growth == pytest.approx(0.05 * 0.003**2, rel=0.1)

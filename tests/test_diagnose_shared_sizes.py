@@ -12,7 +12,7 @@ from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.effects.candidates import effect_candidates
 from gyrostab.diagnose.effects.cells import begin_state, cross_column, pair_rows
 from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.modelling.shared import shared_sizes
+from gyrostab.diagnose.modelling.shared_sizes import shared_sizes
 from tests.named import COEFFICIENT, record
 
 AXES = ("x", "y", "z")

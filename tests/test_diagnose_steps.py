@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import warnings
 
 import numpy as np
@@ -13,11 +12,11 @@ import gyrostab
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.calibration.known import known_motion, without_known_motion
 from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.task import Task, still_lines
 from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
 from tests.named import nulls, record
 
-core = importlib.import_module("gyrostab.diagnose.core")
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 JUMP = {"name": "bias_jump", "step": [2.0], "at": 807.0}  # 50 standard deviations of a block's mean; blocks begin at 800 s and 820 s
 
@@ -67,17 +66,17 @@ def test_hops_between_two_levels_leave_no_line_against_their_own_model():
 
 def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
     """The core reads the log again for its lines; what is loud in blocks that are left out does not matter then."""
-    task = core._Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
+    task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
     reduced = reduce_log(jumped)
     baseline = calibrate(reduced)
     course = np.zeros((1, reduced.sizes["block"]))
     course[:, :12:2] = 5.0  # the first part has the blocks 0 to 11
     known = baseline.assign(known_mean=(("axis", "block"), course))
-    found = core._still_lines(task, reduced, known)
+    found = still_lines(task, reduced, known)
     assert found["line_weight"].values[0, 0] == 0.0
     np.testing.assert_allclose(found["line_power"][:, 2:], reduced["line_power"][:, 2:])
     xr.testing.assert_identical(found.drop_vars(["line_power", "line_weight"]), reduced.drop_vars(["line_power", "line_weight"]))
-    assert core._still_lines(task, reduced, baseline) is reduced
+    assert still_lines(task, reduced, baseline) is reduced
 
 
 def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_else():

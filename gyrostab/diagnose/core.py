@@ -5,50 +5,26 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
 from gyrostab.diagnose.calibration.known import known_motion, without_known_lines
-from gyrostab.diagnose.conclusion.account import explanations, unexpected
-from gyrostab.diagnose.conclusion.content import (
-    baseline_table,
-    claim_tables,
-    effect_tables,
-    limit_tables,
-    mismatch_tables,
-    model_tables,
-    motion_tables,
-    recording_table,
-    surfaces_with_blocks,
-    unknown_tables,
-    verdict,
-)
-from gyrostab.diagnose.conclusion.evidence import held_out
-from gyrostab.diagnose.conclusion.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
-from gyrostab.diagnose.conclusion.surfaces import make_surfaces
-from gyrostab.diagnose.effects.explained import without_odd
+from gyrostab.diagnose.conclusion.account import unexpected
+from gyrostab.diagnose.conclusion.conclude import conclude
+from gyrostab.diagnose.conclusion.result import Diagnosis
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.locating.locate import locate
-from gyrostab.diagnose.locating.null_scores import NullScores, null_scores
-from gyrostab.diagnose.modelling.expected_effects import expected_baseline, fit_expected, without_expected
-from gyrostab.diagnose.modelling.limits import limits
-from gyrostab.diagnose.modelling.odd_power import with_odd_power
-from gyrostab.diagnose.modelling.predict import predicted
-from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise, without_hops
-from gyrostab.diagnose.modelling.refit import Fitted, fit_claims
-from gyrostab.diagnose.naming.claims import Claim
-from gyrostab.diagnose.naming.levels import without_levels
+from gyrostab.diagnose.locating.null_scores import null_scores
+from gyrostab.diagnose.modelling.expected_effects import expected_baseline, without_expected
+from gyrostab.diagnose.modelling.recalibrate import without_hops
 from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
-from gyrostab.diagnose.naming.name import Naming, name_effects
-from gyrostab.diagnose.naming.waves import without_waves
+from gyrostab.diagnose.naming.name import name_effects
 from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.task import Compared, Task, still_lines
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
@@ -128,50 +104,6 @@ def diagnose(
         return _diagnose(log, simulation, quiet, seed, nulls, false_alarm_level, block, restart_gap, progress)
 
 
-@dataclass(frozen=True)
-class _Task:
-    """A recording, and how it is to be compared.
-
-    Attributes
-    ----------
-    log : xarray.Dataset
-        With the axes that are alive.
-    given : Model, xarray.Dataset or None
-        The simulation; None where the noise is to be calibrated.
-    quiet, restart_gap, seed, nulls, level, progress
-        The options of `diagnose`; `level` is its `false_alarm_level`.
-    """
-
-    log: xr.Dataset
-    given: Model | xr.Dataset | None
-    quiet: Any
-    restart_gap: Any
-    seed: int
-    nulls: int
-    level: float
-    progress: Stage
-
-
-class _Compared(NamedTuple):
-    """What a comparison found.
-
-    Attributes
-    ----------
-    reduced : xarray.Dataset
-    baseline : xarray.Dataset
-    found : xarray.Dataset
-        Places of mismatches.
-    naming : Naming
-    null : NullScores
-    """
-
-    reduced: xr.Dataset
-    baseline: xr.Dataset
-    found: xr.Dataset
-    naming: Naming
-    null: NullScores
-
-
 def _diagnose(
     log: xr.Dataset,
     simulation: Any,
@@ -194,13 +126,13 @@ def _diagnose(
         log = log.sel(axis=alive)
         reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
         given = given.sel(axis=alive) if isinstance(given, xr.Dataset) else given
-    task = _Task(log, given, quiet, restart_gap, seed, nulls, level, progress)
+    task = Task(log, given, quiet, restart_gap, seed, nulls, level, progress)
     compared = _beside_hops(task, _at_rest(task, _compare(task, *_calibrated(task, reduced))))
     progress("fitting", 0)
-    return _concluded(task, compared, begun)
+    return conclude(task, compared, begun)
 
 
-def _compare(task: _Task, reduced: xr.Dataset, baseline: xr.Dataset) -> _Compared:
+def _compare(task: Task, reduced: xr.Dataset, baseline: xr.Dataset) -> Compared:
     """Draw null records, name effects, locate what is beyond chance."""
     seen = without_known_lines(reduced, baseline)
     records = _records(seen, baseline, task.nulls, task.seed)
@@ -211,12 +143,12 @@ def _compare(task: _Task, reduced: xr.Dataset, baseline: xr.Dataset) -> _Compare
     known = _known_apart(baseline, task.given)
     naming = name_effects(seen, baseline, records(), level=half, seed=task.seed, known=known, progress=task.progress)
     before = expected_baseline(naming, baseline)
-    apart = without_expected(_still_lines(task, seen, before) if naming.expected else seen, baseline, naming.expected)
+    apart = without_expected(still_lines(task, seen, before) if naming.expected else seen, baseline, naming.expected)
     found = unexpected(locate(apart, before, null, level=half), naming.expected, seen, before, null, level=half)
-    return _Compared(reduced, baseline, found, naming, null)
+    return Compared(reduced, baseline, found, naming, null)
 
 
-def _calibrated(task: _Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+def _calibrated(task: Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """The record and its baseline; the record without the blocks in which a model that was given says that the rate moves."""
     task.progress("calibrating", 0)
     baseline = _baseline(task, reduced)
@@ -227,7 +159,7 @@ def _calibrated(task: _Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Datase
     return reduced, baseline
 
 
-def _at_rest(task: _Task, compared: _Compared) -> _Compared:
+def _at_rest(task: Task, compared: Compared) -> Compared:
     """The comparison once more without the blocks of a motion that has no name; the same where there are none, or too few are left."""
     moving = unexplained_motion(compared.reduced, compared.naming.claims) if task.given is None else np.zeros(1, np.bool_)
     if not moving.any():
@@ -240,7 +172,7 @@ def _at_rest(task: _Task, compared: _Compared) -> _Compared:
         return compared
 
 
-def _beside_hops(task: _Task, compared: _Compared) -> _Compared:
+def _beside_hops(task: Task, compared: Compared) -> Compared:
     """The comparison once more with the noise calibrated beside hops within blocks; the same where there are none."""
     baseline = without_hops(compared.naming, compared.baseline)
     return compared if baseline is compared.baseline else _compare(task, compared.reduced, baseline)
@@ -284,7 +216,7 @@ def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:
             )
 
 
-def _baseline(task: _Task, reduced: xr.Dataset) -> xr.Dataset:
+def _baseline(task: Task, reduced: xr.Dataset) -> xr.Dataset:
     if task.given is None:
         return calibrate(reduced, quiet=task.quiet)
     if task.quiet is not None:
@@ -314,118 +246,9 @@ def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -
     return recall
 
 
-def _still_lines(task: _Task, reduced: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
-    """The record with the line spectra of the blocks in which nothing that is known moves; the log is read once more where something does.
-
-    A step within a block has the spectrum of a step, and a part of the record has only one for all its blocks.
-    """
-    there = np.isfinite(reduced["power"].transpose("axis", "block", "band").values).any(axis=-1)
-    moving = known_motion(reduced, known)
-    if not (moving & there).any():
-        return reduced
-    calm = without_motion(task.log, reduced, moving | ~there, restart_gap=task.restart_gap, progress=task.progress)
-    return without_known_lines(reduced.assign({name: calm[name] for name in ("line_power", "line_weight")}), known)
-
-
 def _known_apart(baseline: xr.Dataset, given: xr.Dataset | Model | None) -> list[Effect]:
     """Effects of the model that its baseline leaves out, in part or whole."""
     return [one for one in given.effects if one.name in baseline.attrs["left_out"]] if isinstance(given, Model) else []
-
-
-class _Fit(NamedTuple):
-    """The effects in their final numbers.
-
-    Attributes
-    ----------
-    naming : Naming
-        With designs for the noise below.
-    noise : xarray.Dataset
-        The baseline with the noise as it is beside the effects.
-    fitted, expected : list of Fitted
-        Effects that the simulation lacks, and those that it has as well.
-    """
-
-    naming: Naming
-    noise: xr.Dataset
-    fitted: list[Fitted]
-    expected: list[Fitted]
-
-
-def _concluded(task: _Task, compared: _Compared, begun: float) -> Diagnosis:
-    """Fit what was named, see what it is worth and what is left, and put it all into one result."""
-    reduced, baseline, naming = compared.reduced, compared.baseline, compared.naming
-    first = fit_claims(naming, baseline)
-    fit = _fitted_beside_their_noise(naming, baseline, first)
-    before = expected_baseline(fit.naming, baseline)
-    after = predicted(fit.naming, fit.noise) if naming.claims else before
-    mismatches = _mismatches(task, compared, fit, after)
-    unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
-    held = _worth(reduced, baseline, naming, first)
-    content = {
-        "schema": SCHEMA,
-        "recording": recording_table(reduced),
-        "baseline": baseline_table(baseline, fit.expected),
-        "verdict": verdict(mismatches, fit.naming.claims, unexplained),
-        "false_alarm_level": task.level,
-        "mismatches": mismatches,
-        "effects": effect_tables(fit.fitted, reduced),
-        "unexplained": unexplained,
-        "not_found": limit_tables(limits(fit.naming)),
-        "held_out": {name: held[name] for name in HELD_OUT},
-        "seconds": round(time.perf_counter() - begun, 3),
-    }
-    own = task.given if isinstance(task.given, Model) else None
-    diagnosis = Diagnosis(plain(content), _surfaces(reduced, fit, before, after), model_tables(fit.noise, fit.fitted, own))
-    check_diagnosis(diagnosis.content)
-    return diagnosis
-
-
-def _fitted_beside_their_noise(naming: Naming, baseline: xr.Dataset, first: list[Fitted]) -> _Fit:
-    """Calibrate the noise beside the effects as they were fitted `first`, and fit them once more to what is left."""
-    noise = recalibrate(naming, baseline, first)
-    if noise is baseline:
-        return _Fit(naming, baseline, first, fit_expected(naming, baseline))
-    naming = with_noise(naming, noise)
-    return _Fit(naming, noise, fit_claims(naming, noise), fit_expected(naming, baseline))
-
-
-def _worth(reduced: xr.Dataset, baseline: xr.Dataset, naming: Naming, first: Sequence[Fitted]) -> dict[str, float]:
-    """What the effects gain on time that they were not fitted to, each by the views that can tell; the noise is fitted with them."""
-    told, hopping = without_levels(naming)
-    judged, waving = without_waves(told)
-
-    def trained(chosen: Naming, known: NDArray[np.bool_]) -> xr.Dataset:
-        own = recalibrate(chosen, baseline, first, known)
-        return predicted(with_noise(chosen, own), own, known)
-
-    parts = [part for claim in told.claims for part in claim.parts]
-    odd = sum(part.gain for part in parts if part.candidate.view == "marks")  # no other number has them
-    clean = without_odd(reduced, [*parts, *(part for claim in told.expected for part in claim.parts)])
-    start = partial(expected_baseline, told, baseline) if told.expected else baseline
-    whole, rest = (partial(trained, one) if one.claims else start for one in (told, judged))
-    return held_out(clean, start, rest, more_gain=odd + hopping + waving, shown=whole if waving else None)
-
-
-def _mismatches(task: _Task, compared: _Compared, fit: _Fit, after: xr.Dataset) -> list[dict[str, Any]]:
-    """Places beyond chance and those of what was named, each with the effects that explain it."""
-    reduced, found, claims = compared.reduced, compared.found, fit.naming.claims
-
-    def without(left_out: Sequence[Claim]) -> xr.Dataset:
-        return predicted(fit.naming, fit.noise, left_out=left_out)
-
-    lines = _still_lines(task, reduced, after) if claims and (found["view"] == "spectrum").any() else None
-    explained = explanations(found, claims, reduced, after, compared.null, level=task.level / 2.0, without=without, still=lines)
-    mismatches = mismatch_tables(found, reduced, explained)
-    mismatches += claim_tables(fit.naming, reduced, mismatches)
-    mismatches += unknown_tables(fit.naming, reduced, mismatches)
-    return mismatches + motion_tables(claims, reduced, mismatches)
-
-
-def _surfaces(reduced: xr.Dataset, fit: _Fit, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
-    """The recording beside the simulation without and with the effects, odd samples in both of them as they are in the recording."""
-    before = with_odd_power(before, reduced, fit.expected)
-    after = with_odd_power(after, reduced, [*fit.expected, *fit.fitted])
-    return surfaces_with_blocks(make_surfaces(reduced, before, after), reduced, before, after)
 
 
 def quiet_span(text: str) -> tuple[float | str, float | str]:

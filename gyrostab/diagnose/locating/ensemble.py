@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from gyrostab.diagnose.calibration.noise_statistics import line_columns, white_variance
 from gyrostab.diagnose.gains.wander import known_wander
-from gyrostab.diagnose.locating.shared import Shared, shared_by, shared_spectra, shared_white
+from gyrostab.diagnose.locating.shared_noise import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.outliers import CHANCE, beyond_chance
 from gyrostab.kernels.periodogram import band_covariance, taper
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times, ornstein_uhlenbeck_means
@@ -27,7 +27,8 @@ __all__ = ["null_records"]
 Array = NDArray[np.float64]
 _CHUNK = 25
 _POOL = 10**6  # samples made one by one
-_NEXT = 2  # bands above that share scatter with one
+_NEXT = 4  # bands above that share scatter with one
+_SLIGHT = 0.003  # correlation of two bands that makes no difference
 _COMMON = 0.9  # of the scatter of a band that it may share with others
 _COARSE = 1.5  # standard deviations: a lattice step from which on the values are few levels
 
@@ -106,16 +107,30 @@ def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) 
 
 
 def _ties(shape: Array, size: int) -> list[Array]:
-    """Shapes (axis, block, band) of what each band has in common with the first, second, ... band above it, as the taper makes it."""
+    """Shapes (axis, block, band) of what each band has in common with the first, second, ... band above it, as the taper makes it.
+
+    What is next to nothing, which the high bands have with those further above, is left out.
+    """
     covariance = band_covariance(size)
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 0.0)
-    ties = [safe[..., :-apart] * safe[..., apart:] * np.diagonal(covariance, apart) for apart in range(1, _NEXT + 1)]
+    ties = []
+    for apart in range(1, min(_NEXT, safe.shape[-1] - 1) + 1):
+        tie = safe[..., :-apart] * safe[..., apart:] * np.diagonal(covariance, apart)
+        correlation = np.sqrt(np.diagonal(covariance, apart) * tie)
+        told = np.flatnonzero((correlation > _SLIGHT).reshape(-1, correlation.shape[-1]).any(axis=0))
+        ties.append(tie[..., : told.max(initial=-1) + 1])
     total = np.zeros_like(safe)
-    for apart, tie in enumerate(ties, start=1):
-        total[..., :-apart] += tie
-        total[..., apart:] += tie
+    for low, high, tie in _between(total, ties):
+        low += tie
+        high += tie
     least = np.divide(_COMMON * safe, total, out=np.ones_like(safe), where=total > _COMMON * safe)
-    return [tie * np.minimum(least[..., :-apart], least[..., apart:]) for apart, tie in enumerate(ties, start=1)]
+    return [tie * np.minimum(low, high) for low, high, tie in _between(least, ties)]
+
+
+def _between(values: Array, ties: list[Array]) -> Iterator[tuple[Array, Array, Array]]:
+    """Views of the lower and the upper band of each tie, the tie beside them."""
+    for apart, tie in enumerate(ties, start=1):
+        yield values[..., : tie.shape[-1]], values[..., apart : apart + tie.shape[-1]], tie
 
 
 def _tails(reduced: xr.Dataset, density: Array, rng: np.random.Generator) -> tuple[float, float]:
@@ -194,14 +209,14 @@ def _tied(shape: Array, ties: list[Array], mean: Array, rng: np.random.Generator
     """As `_gamma`, where bands have gamma parts in common: parts of one scale add up to what their shapes add up to."""
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
     alone = safe.copy()
-    for apart, tie in enumerate(ties, start=1):
-        alone[..., :-apart] -= tie
-        alone[..., apart:] -= tie
+    for low, high, tie in _between(alone, ties):
+        low -= tie
+        high -= tie
     drawn = rng.standard_gamma(np.broadcast_to(alone, mean.shape))
-    for apart, tie in enumerate(ties, start=1):
+    for low, high, tie in _between(drawn, ties):
         both = rng.standard_gamma(np.broadcast_to(tie, (len(mean), *tie.shape)))
-        drawn[..., :-apart] += both
-        drawn[..., apart:] += both
+        low += both
+        high += both
     return np.asarray(drawn / safe * mean)
 
 

@@ -15,9 +15,9 @@ from gyrostab.diagnose.effects.cells import State, begin_state, harmonic_sets
 from gyrostab.diagnose.effects.explained import Part, explain_away, mirrored
 from gyrostab.diagnose.effects.response import is_filter
 from gyrostab.diagnose.effects.sizes import part_mixture
-from gyrostab.diagnose.modelling.levels import level_sizes
+from gyrostab.diagnose.modelling.level_sizes import level_sizes
 from gyrostab.diagnose.modelling.nuisance import sizes_over
-from gyrostab.diagnose.modelling.shared import shared_sizes
+from gyrostab.diagnose.modelling.shared_sizes import shared_sizes
 from gyrostab.diagnose.naming.filters import filter_sizes
 from gyrostab.diagnose.naming.name import Claim, Naming, Unknown
 from gyrostab.diagnose.naming.odd import line_size, mark_sizes

@@ -22,8 +22,8 @@ from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown, form_error, 
 from gyrostab.diagnose.naming.complete import flexible, redness, unrest
 from gyrostab.diagnose.naming.expected_claims import expected_claims
 from gyrostab.diagnose.naming.filters import without_slopes
+from gyrostab.diagnose.naming.hopping import followed_first, hopping, renewed
 from gyrostab.diagnose.naming.layers import found_again, layers
-from gyrostab.diagnose.naming.levels import followed_first, hopping, renewed
 from gyrostab.diagnose.naming.parts import PLAIN_LINE, axes_of, by_key, gain_sum, lines_only, parts_of, tried_again, without_lines
 from gyrostab.diagnose.naming.structure import plainer_effect, possible, structural, without_pulses
 from gyrostab.diagnose.naming.surrogates import beats_slides

@@ -1,0 +1,141 @@
+"""From names to a result: fit the effects, see what they are worth and what is left, and put it all together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.conclusion.account import explanations
+from gyrostab.diagnose.conclusion.content import (
+    baseline_table,
+    claim_tables,
+    effect_tables,
+    limit_tables,
+    mismatch_tables,
+    model_tables,
+    motion_tables,
+    recording_table,
+    surfaces_with_blocks,
+    unknown_tables,
+    verdict,
+)
+from gyrostab.diagnose.conclusion.evidence import held_out
+from gyrostab.diagnose.conclusion.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
+from gyrostab.diagnose.conclusion.surfaces import make_surfaces
+from gyrostab.diagnose.effects.explained import without_odd
+from gyrostab.diagnose.modelling.expected_effects import expected_baseline, fit_expected
+from gyrostab.diagnose.modelling.limits import limits
+from gyrostab.diagnose.modelling.odd_power import with_odd_power
+from gyrostab.diagnose.modelling.predict import predicted
+from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.modelling.refit import Fitted, fit_claims
+from gyrostab.diagnose.naming.claims import Claim
+from gyrostab.diagnose.naming.hopping import without_levels
+from gyrostab.diagnose.naming.name import Naming
+from gyrostab.diagnose.naming.waves import without_waves
+from gyrostab.diagnose.task import Compared, Task, still_lines
+from gyrostab.simulate.model import Model
+
+__all__ = ["Fit", "conclude", "fitted_beside_their_noise", "worth"]
+
+
+class Fit(NamedTuple):
+    """The effects in their final numbers.
+
+    Attributes
+    ----------
+    naming : Naming
+        With designs for the noise below.
+    noise : xarray.Dataset
+        The baseline with the noise as it is beside the effects.
+    fitted, expected : list of Fitted
+        Effects that the simulation lacks, and those that it has as well.
+    """
+
+    naming: Naming
+    noise: xr.Dataset
+    fitted: list[Fitted]
+    expected: list[Fitted]
+
+
+def conclude(task: Task, compared: Compared, begun: float) -> Diagnosis:
+    """Fit what was named, see what it is worth and what is left, and put it all into one result."""
+    reduced, baseline, naming = compared.reduced, compared.baseline, compared.naming
+    first = fit_claims(naming, baseline)
+    fit = fitted_beside_their_noise(naming, baseline, first)
+    before = expected_baseline(fit.naming, baseline)
+    after = predicted(fit.naming, fit.noise) if naming.claims else before
+    mismatches = _mismatches(task, compared, fit, after)
+    unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
+    held = worth(reduced, baseline, naming, first)
+    content = {
+        "schema": SCHEMA,
+        "recording": recording_table(reduced),
+        "baseline": baseline_table(baseline, fit.expected),
+        "verdict": verdict(mismatches, fit.naming.claims, unexplained),
+        "false_alarm_level": task.level,
+        "mismatches": mismatches,
+        "effects": effect_tables(fit.fitted, reduced),
+        "unexplained": unexplained,
+        "not_found": limit_tables(limits(fit.naming)),
+        "held_out": {name: held[name] for name in HELD_OUT},
+        "seconds": round(time.perf_counter() - begun, 3),
+    }
+    own = task.given if isinstance(task.given, Model) else None
+    diagnosis = Diagnosis(plain(content), _surfaces(reduced, fit, before, after), model_tables(fit.noise, fit.fitted, own))
+    check_diagnosis(diagnosis.content)
+    return diagnosis
+
+
+def fitted_beside_their_noise(naming: Naming, baseline: xr.Dataset, first: list[Fitted]) -> Fit:
+    """Calibrate the noise beside the effects as they were fitted `first`, and fit them once more to what is left."""
+    noise = recalibrate(naming, baseline, first)
+    if noise is baseline:
+        return Fit(naming, baseline, first, fit_expected(naming, baseline))
+    naming = with_noise(naming, noise)
+    return Fit(naming, noise, fit_claims(naming, noise), fit_expected(naming, baseline))
+
+
+def worth(reduced: xr.Dataset, baseline: xr.Dataset, naming: Naming, first: Sequence[Fitted]) -> dict[str, float]:
+    """What the effects gain on time that they were not fitted to, each by the views that can tell; the noise is fitted with them."""
+    told, hopping = without_levels(naming)
+    judged, waving = without_waves(told)
+
+    def trained(chosen: Naming, known: NDArray[np.bool_]) -> xr.Dataset:
+        own = recalibrate(chosen, baseline, first, known)
+        return predicted(with_noise(chosen, own), own, known)
+
+    parts = [part for claim in told.claims for part in claim.parts]
+    odd = sum(part.gain for part in parts if part.candidate.view == "marks")  # no other number has them
+    clean = without_odd(reduced, [*parts, *(part for claim in told.expected for part in claim.parts)])
+    start = partial(expected_baseline, told, baseline) if told.expected else baseline
+    whole, rest = (partial(trained, one) if one.claims else start for one in (told, judged))
+    return held_out(clean, start, rest, more_gain=odd + hopping + waving, shown=whole if waving else None)
+
+
+def _mismatches(task: Task, compared: Compared, fit: Fit, after: xr.Dataset) -> list[dict[str, Any]]:
+    """Places beyond chance and those of what was named, each with the effects that explain it."""
+    reduced, found, claims = compared.reduced, compared.found, fit.naming.claims
+
+    def without(left_out: Sequence[Claim]) -> xr.Dataset:
+        return predicted(fit.naming, fit.noise, left_out=left_out)
+
+    lines = still_lines(task, reduced, after) if claims and (found["view"] == "spectrum").any() else None
+    explained = explanations(found, claims, reduced, after, compared.null, level=task.level / 2.0, without=without, still=lines)
+    mismatches = mismatch_tables(found, reduced, explained)
+    mismatches += claim_tables(fit.naming, reduced, mismatches)
+    mismatches += unknown_tables(fit.naming, reduced, mismatches)
+    return mismatches + motion_tables(claims, reduced, mismatches)
+
+
+def _surfaces(reduced: xr.Dataset, fit: Fit, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
+    """The recording beside the simulation without and with the effects, odd samples in both of them as they are in the recording."""
+    before = with_odd_power(before, reduced, fit.expected)
+    after = with_odd_power(after, reduced, [*fit.expected, *fit.fitted])
+    return surfaces_with_blocks(make_surfaces(reduced, before, after), reduced, before, after)
