@@ -37,7 +37,7 @@ def reduced_of(rate: np.ndarray) -> xr.Dataset:
 
 def loud(factor: np.ndarray) -> np.ndarray:
     """White noise on one axis, its standard deviation times a factor for each block."""
-    return np.random.default_rng(1).standard_normal((1, BLOCKS * LENGTH)) * np.repeat(factor, LENGTH)
+    return np.asarray(np.random.default_rng(1).standard_normal((1, BLOCKS * LENGTH)) * np.repeat(factor, LENGTH))
 
 
 def started(rate: np.ndarray) -> State:

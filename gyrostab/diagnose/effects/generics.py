@@ -66,7 +66,7 @@ def generic_candidates(reduced: xr.Dataset) -> list[Candidate]:
     bands = reduced.sizes["band"]
     level = hats[:, None, :, None] * white
     shapes = np.eye(bands)[:, None, None, :]
-    bursts = tuple(_burst(*one, reduced, white) for one in stretches(reduced.sizes["block"]).tolist())
+    bursts = tuple(_burst(first, stop, reduced, white) for first, stop in stretches(reduced.sizes["block"]).tolist())
     found = [
         Candidate("~bias(t)", "mean", (), (Variant({}, _numbered(len(hats)), hats[:, None, :]),)),
         Candidate("~N(t)", "power", (), (Variant({}, _numbered(len(hats)), level),)),

@@ -107,7 +107,7 @@ def _beside_scatter(part: Part, state: State) -> float:
     size, covariance = likely.moments()
     wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0]))) * float(np.ptp(part.variant.design))
     instants = np.log(len(part.candidate.variants))
-    return float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without)) - np.log(wide) - 0.5 - instants
+    return float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without) - np.log(wide) - 0.5 - instants)
 
 
 def _scatter(part: Part, state: State) -> list[Array]:
