@@ -14,11 +14,13 @@ from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.generics import stretches
 from gyrostab.diagnose.effects.search import gains
 from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.naming.name import name_effects
 from gyrostab.diagnose.naming.parts import by_key, gain_sum
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.views import locked
 from gyrostab.log import make_log
 from tests.named import nulls
 
@@ -131,17 +133,27 @@ def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) 
     assert beats == bool(leak)
 
 
-@pytest.mark.parametrize("size", [0.0, 6.0])
-def test_waves_that_do_not_turn_with_the_tool_are_no_line_of_its_turning(size: float) -> None:
-    """Swell about 0.3 Hz comes in groups, twenty times above the noise, and the tool turns as often."""
+def swelling(size: float) -> State:
+    """Swell about 0.3 Hz that comes in groups, twenty times above the noise; a tool that turns as often, with a line of its turning."""
     rng = np.random.default_rng(5)
     swell = lfilter([1.0], [1.0, -2.0 * 0.97 * np.cos(2.0 * np.pi * 0.03), 0.97**2], rng.standard_normal(SECOND.size))
     swell *= np.where(SECOND % 900.0 < 350.0, 4.0, 0.2) * WHITE
     turns = 0.3 * SECOND + 0.3 * np.sin(2.0 * np.pi * SECOND / 400.0)
-    log = make_log(WHITE * rng.standard_normal((1, SECOND.size)) + swell + size * np.sin(2.0 * np.pi * turns), rate=RATE, unit="deg/h")
-    rate = 360.0 * np.gradient(turns, SECOND)
-    reduced = reduce_log(log.assign(rotation_rate=("time", rate, {"units": "degree s-1"})), block=20.0)
-    state = begin_state(reduced, from_model(reduced, {**MODEL, "log": {"axes": ["x"]}}))
+    rate = WHITE * rng.standard_normal((1, SECOND.size)) + swell + size * np.sin(2.0 * np.pi * turns)
+    return turned(rate, turns)
+
+
+def turned(rate: np.ndarray, turns: np.ndarray) -> State:
+    """Rates (axis, time) [deg/h] with the channel of a tool that has made so many turns."""
+    log = make_log(rate, rate=RATE, unit="deg/h")
+    turning = 360.0 * np.gradient(turns, SECOND)
+    reduced = reduce_log(log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block=20.0)
+    return begin_state(reduced, from_model(reduced, {**MODEL, "log": {"axes": ["x"]}}))
+
+
+@pytest.mark.parametrize("size", [0.0, 6.0])
+def test_waves_that_do_not_turn_with_the_tool_are_no_line_of_its_turning(size: float) -> None:
+    state = swelling(size)
     found = parts_of(state, candidate(state, "rotation_line", "order"))
     assert (gain_sum(found) > 15.0) == (size > 0.0)
 
@@ -153,12 +165,17 @@ def test_what_turns_with_the_tool_leaves_the_noise_about_it_alone() -> None:
     rate = WHITE * rng.standard_normal(SECOND.size)
     quiet = rate.copy()
     rate = rate + sum(size * np.sin(2.0 * np.pi * k * turns) for k, size in ((1, 3.0), (2, 5.0), (3, 2.0)))
-    level = []
-    for values in (rate, quiet):
-        log = make_log(values[None], rate=RATE, unit="deg/h")
-        turning = 360.0 * np.gradient(turns, SECOND)
-        reduced = reduce_log(log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block=20.0)
-        level.append(reduced["order_level"].values[0])
+    level = [turned(values[None], turns).reduced["order_level"].values[0] for values in (rate, quiet)]
     usual = 3600.0 * 0.003**2
     assert np.nanmean(level[1]) == pytest.approx(usual, rel=0.08)
     assert np.nanmedian(level[0]) < 3.0 * usual
+
+
+def test_what_is_scored_at_orders_is_as_wild_as_in_null_records() -> None:
+    state = swelling(0.0)
+    (drawn,) = null_records(state.reduced, state.baseline, count=40, rng=np.random.default_rng(1), chunk=40)
+    real, noise = (locked.score(one, state.baseline) for one in (state.reduced, drawn))
+    assert real is not None
+    assert noise is not None
+    largest = noise["z"].max([dim for dim in noise["z"].dims if dim != "record"])
+    assert float(real["z"].max()) < 2.0 * float(largest.max())

@@ -324,7 +324,7 @@ def _witness(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[n
 
 
 def _orders(frame: _Frame, expected: Array, rng: np.random.Generator) -> NDArray[np.complex128]:
-    """Amplitudes at multiples of the rotation: Gaussian with the density at that frequency."""
+    """Amplitudes at multiples of the rotation: Gaussian with the density at that frequency, or with that beside it where that is more."""
     reduced = frame.reduced
     found = _ordered(reduced, "order", "axis", "block", "harmonic")
     rate = float(reduced.attrs["sampling_rate_hz"])
@@ -338,6 +338,8 @@ def _orders(frame: _Frame, expected: Array, rng: np.random.Generator) -> NDArray
         low = np.minimum(at.astype(int), bands.size - 2)
         block = np.arange(turning.size)
         density = expected[:, :, block, low] * (1.0 - (at - low)) + expected[:, :, block, low + 1] * (at - low)
+        if "order_level" in reduced:
+            density = np.fmax(density, _ordered(reduced, "order_level", "axis", "block", "harmonic")[..., place])
         noise = rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
         out[..., place] = np.sqrt(2.0 * density * rate / samples) * noise
     out[..., np.isnan(found)] = np.nan

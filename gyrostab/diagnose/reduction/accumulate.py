@@ -29,8 +29,8 @@ FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
 #: Pieces of a block over which the axes are averaged.
 PIECES = 16
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
-_BESIDE = (2, 6)  # turns in a block, from and below, beside those of the tool, where the noise about an order is measured
-_APART = 1.0  # turns in a block, that these are away from what was taken off
+_BESIDE = (1, 5)  # turns in a block, from and below, beside those of the tool, where the noise about an order is measured
+_APART = 0.9  # turns in a block, that these are away from what was taken off
 _GAP_S = 1.0  # shorter gaps are not listed
 _FOR_LATTICE = 64  # blocks whose values are kept
 

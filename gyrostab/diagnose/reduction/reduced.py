@@ -291,7 +291,7 @@ def _locked(work: Accumulator) -> dict[str, Any]:
     if work.order is not None:
         attrs = _named("complex amplitude at multiples of the tool's rotation, NaN below one turn in the block", _RATE)
         found["order"] = (("axis", "block", "harmonic"), work.order, attrs)
-        level = _named("density of what turns 2 to 5 times in the block more or less than that, two-sided", _POWER)
+        level = _named("density of what turns 1 to 4 times in the block more or less than that, two-sided", _POWER)
         found["order_level"] = (("axis", "block", "harmonic"), work.order_level, level)
     if work.profile_sums is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
