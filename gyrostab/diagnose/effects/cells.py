@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.candidates import Candidate
 from gyrostab.diagnose.gains.gain import Cells, independent, noise_columns
-from gyrostab.diagnose.reduction.reduced import measured
+from gyrostab.diagnose.reduction.reduced import measured, noise_at_orders
 from gyrostab.kernels.periodogram import taper
 
 __all__ = [
@@ -246,19 +246,14 @@ def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
 
 
 def order_weight(state: State) -> Array:
-    """(axis, block, harmonic): one over the variance of each part of a complex amplitude.
-
-    The noise about an order is the expected one, or what turns almost as often in the same block where that is more: waves that have
-    nothing to do with the rotation, as those of the ground, are as loud there.
-    """
+    """(axis, block, harmonic): one over the variance of each part of a complex amplitude."""
     reduced = state.reduced
     rate, frequency = float(reduced.attrs["sampling_rate_hz"]), reduced["frequency"].values
     place = np.abs(reduced["channel_rotation_rate"].values)[:, None] / 360.0 * reduced["harmonic"].values
     good = np.isfinite(reduced["order"].values) & (place * float(reduced.attrs["block_s"]) >= 2.0) & (place < rate / 2.0)
     nearest = np.abs(np.log(np.maximum(place, frequency[0])[..., None] / frequency)).argmin(axis=-1)
     level = np.take_along_axis(state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2)
-    if "order_level" in reduced:
-        level = np.fmax(level, reduced["order_level"].transpose("axis", "block", "harmonic").values)
+    level = noise_at_orders(reduced, level)
     seconds = reduced["samples"].values[..., None] / rate
     return np.where(good, seconds / (2.0 * level), 0.0)
 

@@ -18,6 +18,7 @@ from gyrostab.diagnose.calibration.noise_statistics import line_columns, white_v
 from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.locating.shared_noise import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.outliers import CHANCE, beyond_chance
+from gyrostab.diagnose.reduction.reduced import noise_at_orders
 from gyrostab.kernels.periodogram import band_covariance, taper
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times, ornstein_uhlenbeck_means
 from gyrostab.noise import HOUR
@@ -331,17 +332,15 @@ def _orders(frame: _Frame, expected: Array, rng: np.random.Generator) -> NDArray
     samples = np.maximum(_ordered(reduced, "samples", "axis", "block"), 1)
     turning = np.abs(np.nan_to_num(reduced["channel_rotation_rate"].values)) / 360.0
     bands = np.log(reduced["frequency"].values)
-    out = np.empty((len(expected), *found.shape), np.complex128)
+    density = np.empty((len(expected), *found.shape))
     for place, harmonic in enumerate(reduced["harmonic"].values):
         folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
         at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
         low = np.minimum(at.astype(int), bands.size - 2)
         block = np.arange(turning.size)
-        density = expected[:, :, block, low] * (1.0 - (at - low)) + expected[:, :, block, low + 1] * (at - low)
-        if "order_level" in reduced:
-            density = np.fmax(density, _ordered(reduced, "order_level", "axis", "block", "harmonic")[..., place])
-        noise = rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
-        out[..., place] = np.sqrt(2.0 * density * rate / samples) * noise
+        density[..., place] = expected[:, :, block, low] * (1.0 - (at - low)) + expected[:, :, block, low + 1] * (at - low)
+    noise = rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
+    out = np.asarray(np.sqrt(2.0 * noise_at_orders(reduced, density) * rate / samples[..., None]) * noise)
     out[..., np.isnan(found)] = np.nan
     return out
 

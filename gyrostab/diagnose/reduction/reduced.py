@@ -19,7 +19,7 @@ from gyrostab.timegrid import grid_index, grid_times
 from gyrostab.units import INNER
 from gyrostab.windows import duration_seconds, samples
 
-__all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "reduce_log"]
+__all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "noise_at_orders", "reduce_log"]
 
 Array = NDArray[np.float64]
 _BLOCK_S, _FEWEST, _MOST, _LEAST_SAMPLES, _MUST = 20.0, 90, 6000, 100, 24
@@ -27,6 +27,7 @@ _SMOOTH = 2.0  # blocks over which the course of a channel is smoothed at most
 _MEAN_SHARE = 0.1  # of a block that must be present for its mean
 _POWER = "degree2 hour-2 Hz-1"
 _RATE = INNER["rate"]
+_LOUDER = 2.0  # times the expected density, beyond which what is measured beside an order is no chance
 
 
 def block_samples(size: int, rate: float, block: Any = None) -> int:
@@ -152,6 +153,24 @@ def reduce_log(
 def measured(reduced: xr.Dataset, name: str) -> xr.DataArray:
     """A variable of the reduced record as the axes measured it, with what of it is left out because they moved."""
     return reduced[f"measured_{name}"] if f"measured_{name}" in reduced else reduced[name]
+
+
+def noise_at_orders(reduced: xr.Dataset, expected: Array) -> Array:
+    """Density of the noise about the orders of the rotation: the expected one, or what turns almost as often where that is surely more.
+
+    Waves in the recording that have nothing to do with the tool, as those of the ground, are as loud at an order as beside it.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        From `reduce_log`.
+    expected : ndarray, shape (..., axis, block, harmonic)
+        [degree2 hour-2 Hz-1]
+    """
+    if "order_level" not in reduced:
+        return expected
+    beside = reduced["order_level"].transpose("axis", "block", "harmonic").values
+    return np.where(beside > _LOUDER * expected, beside, expected)
 
 
 def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:
