@@ -99,7 +99,7 @@ def test_without_its_channel_an_effect_is_not_named():
     found = named(VIBRATION, drop=("vibration",))
     assert not found.claims
     assert found.verdict == "unknown"
-    assert {one.generic for one in found.unknown} <= {"~N(t)", "~S(f)"}
+    assert {one.generic for one in found.unknown} <= {"~N(t)", "~S(f)", "~burst"}
     assert all(one.axes == ("x",) for one in found.unknown)
 
 

@@ -54,7 +54,10 @@ _TAIL = 0.25
 _LEAST_P = 1e-12
 _FAST = 16  # samples of an instrument that is much faster than the log
 #: Generic -> view in which it is told.
-_GENERIC_VIEW = {"~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution"}
+_GENERIC_VIEW = {
+    "~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar", "~S(f)": "davar", "~cov": "cross_axis",
+    "~outliers": "distribution",
+}  # fmt: skip
 #: Where an effect shows -> view in which it is told.
 _PART_VIEW = {
     "mean": "mean", "wander": "mean", "levels": "mean", "power": "davar", "transfer": "davar", "cross": "cross_axis",
@@ -191,19 +194,30 @@ def _unknown_table(one: Unknown, naming: Naming, reduced: xr.Dataset, number: in
     beside = f"; what comes nearest: {near}" if near else ""
     means, what = view == "mean", GENERICS.get(one.generic, "something differs")
     rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
+    begin, end, when = _when(one, reduced)
     return {
         "id": number,
         "view": view,
         "axes": list(one.axes),
-        "start": iso(reduced, float(reduced["begin"].values[0])),
-        "end": iso(reduced, float(reduced["end"].values[-1])),
+        "start": iso(reduced, begin),
+        "end": iso(reduced, end),
         "tau_min_s": block if means else 1.0 / rate,
         "tau_max_s": float(reduced["end"].values[-1]) / 2.0 if means else block,
         "ratio": None,
         "p_value": p_value,
         "explained_by": [],
-        "statement": f"On {axes_text(one.axes)} {what}, and no known effect says why{beside} ({chance(p_value)}).",
+        "statement": f"On {axes_text(one.axes)} {what}{when}, and no known effect says why{beside} ({chance(p_value)}).",
     }
+
+
+def _when(one: Unknown, reduced: xr.Dataset) -> tuple[float, float, str]:
+    """Begin and end of what has no name [s], with words for an event; else the whole record."""
+    whole = float(reduced["end"].values[-1])
+    found = [(part.variant.values["begin"], part.variant.values["end"]) for part in one.parts if "begin" in part.variant.values]
+    if not found:
+        return float(reduced["begin"].values[0]), whole, ""
+    begin, end = min(first for first, _ in found), max(last for _, last in found)
+    return begin, end, f", {span_text(begin, end, whole)}"
 
 
 def motion_tables(claims: Sequence[Claim], reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

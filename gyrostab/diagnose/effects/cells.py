@@ -6,6 +6,7 @@ is believed of the noise, and what is named so far.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.candidates import Candidate
 from gyrostab.diagnose.gains.gain import Cells, independent, noise_columns
-from gyrostab.diagnose.reduction.reduced import measured
+from gyrostab.diagnose.reduction.reduced import measured, noise_at_orders
 from gyrostab.kernels.periodogram import taper
 
 __all__ = [
@@ -35,6 +36,8 @@ __all__ = [
 ]
 
 Array = NDArray[Any]
+_MOVING = 9.0  # times the noise, beyond which the power of an axis is motion: three times in amplitude
+_CALM = 0.25  # of the blocks that are calm
 _LEAST_SHARE = 0.05  # of the variance of a cross-spectrum, that is left beside the phase of what is shared
 
 
@@ -250,6 +253,7 @@ def order_weight(state: State) -> Array:
     good = np.isfinite(reduced["order"].values) & (place * float(reduced.attrs["block_s"]) >= 2.0) & (place < rate / 2.0)
     nearest = np.abs(np.log(np.maximum(place, frequency[0])[..., None] / frequency)).argmin(axis=-1)
     level = np.take_along_axis(state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2)
+    level = noise_at_orders(reduced, level)
     seconds = reduced["samples"].values[..., None] / rate
     return np.where(good, seconds / (2.0 * level), 0.0)
 
@@ -346,14 +350,34 @@ def witness_power(name: str, reduced: xr.Dataset) -> Array:
 def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
     cross, power = witness_of(candidates[0].witness[0], row, data, state.reduced, state.baseline)
     root = np.sqrt(np.where(power > 0.0, power, np.nan))
+    share = _moving_share(candidates[0].witness[0], power, state)
     weight = 2.0 * state.reduced["shape"].values[row] / state.weight[row]
     weight = np.where(np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0)
     weight = np.concatenate([weight, weight], axis=1)
     with np.errstate(invalid="ignore"):
         values = _parts(cross / root[..., None], axis=1)
     given, precision = _beside(state, "transfer", (state.axes[row],), weight.shape)
-    designs = [_spread([_parts(one * root) for one in variant.design], weight.shape) for each in candidates for variant in each.variants]
+    designs = [
+        _spread([_parts(one * root * share) for one in variant.design], weight.shape) for each in candidates for variant in each.variants
+    ]
     return Cells(values, weight, designs, given, precision)
+
+
+def _moving_share(name: str, power: Array, state: State) -> Array:
+    """Share of the power of another axis (block, band) that is motion; 1 for a channel, whose noise is not known.
+
+    What leaks is motion that comes and goes: while the tool rests axes may have noise and lines in common, which is no leak. So what an
+    axis shows in the calmer blocks of a band, and its expected noise, are no motion.
+    """
+    if name not in state.axes:
+        return np.ones_like(power)
+    row = state.axes.index(name)
+    noise = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a band without data has no motion
+        noise = np.fmax(noise, np.nanquantile(power, _CALM, axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(power > _MOVING * noise, 1.0 - noise / power, 0.0)
 
 
 _BUILDERS = {"power": _power, "cross": _cross, "order": _order, "phase_locked": _profile, "transfer": _transfer}

@@ -49,7 +49,7 @@ class Mixture:
         return mean, np.einsum("g,gij->ij", weight, self.covariance) + np.einsum("g,gi,gj->ij", weight, apart, apart)
 
 
-def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str = "free") -> Mixture:
+def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str = "free", variance: Array | None = None) -> Mixture:
     """Sizes of columns of the block means on an axis, over the grid of random walk and flicker; given columns are free beside them.
 
     Parameters
@@ -59,11 +59,14 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     columns : sequence of ndarray, shape (block,)
     tier : {"free", "calibrated"}
         What the noise may be, as in `gyrostab.diagnose.gains.gain.mean_factors`.
+    variance : ndarray, shape (block,), optional
+        White variance of the means in place of that of the baseline [degree2 hour-2].
     """
     baseline = state.baseline
     row = state.axes.index(axis)
     y = (state.reduced["mean"] - baseline["known_mean"]).transpose("axis", "block").values[row]
-    whole = np.stack([*columns, *state.given.get(("mean", axis), [])], axis=1)
+    every = [*columns, *state.given.get(("mean", axis), [])]
+    whole = np.stack(every, axis=1) if every else np.empty((y.size, 0))
     present = np.isfinite(y)
     size = np.abs(whole - whole.mean(axis=0)).max(axis=0)
     size = np.where(size > 0.0, size, 1.0)
@@ -71,7 +74,7 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     products = mean_products(
         np.where(present, y, 0.0)[:, None],
         whole / size,
-        variance=baseline["mean_variance"].sel(axis=axis).values,
+        variance=baseline["mean_variance"].sel(axis=axis).values if variance is None else variance,
         step=float(state.reduced.attrs["block_s"]),
         present=present,
         wander=known_wander(baseline, axis),
@@ -88,12 +91,12 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     return Mixture(log_weight, mean[:, :own] / scale, covariance[:, :own, :own] / np.outer(scale, scale))
 
 
-def part_mixture(part: Part, state: State, variant: Variant | None = None) -> Mixture:
+def part_mixture(part: Part, state: State, variant: Variant | None = None, *, variance: Array | None = None) -> Mixture:
     """Sizes of a part's columns, in the unit of the parameters (or their squares), when `state` is in the model beside it."""
     variant = variant or part.variant
     if part.candidate.view in ("mean", "levels"):
         row = state.axes.index(part.row[0])
-        return mean_mixture(state, part.row[0], mean_columns(variant, row))
+        return mean_mixture(state, part.row[0], mean_columns(variant, row), variance=variance)
     candidate = replace(part.candidate, variants=(variant,))
     row = view_rows(candidate, state).index(part.row)
     cells = cells_of([candidate], row, state.reduced, state)

@@ -18,6 +18,7 @@ from gyrostab.diagnose.calibration.noise_statistics import line_columns, white_v
 from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.locating.shared_noise import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.outliers import CHANCE, beyond_chance, chance_of_all
+from gyrostab.diagnose.reduction.reduced import noise_at_orders
 from gyrostab.diagnose.reduction.zero_cell import cut_off
 from gyrostab.kernels.periodogram import band_covariance, taper
 from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times, ornstein_uhlenbeck_means
@@ -326,22 +327,22 @@ def _witness(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[n
 
 
 def _orders(frame: _Frame, expected: Array, rng: np.random.Generator) -> NDArray[np.complex128]:
-    """Amplitudes at multiples of the rotation: Gaussian with the density at that frequency."""
+    """Amplitudes at multiples of the rotation: Gaussian with the density at that frequency, or with that beside it where that is more."""
     reduced = frame.reduced
     found = _ordered(reduced, "order", "axis", "block", "harmonic")
     rate = float(reduced.attrs["sampling_rate_hz"])
     samples = np.maximum(_ordered(reduced, "samples", "axis", "block"), 1)
     turning = np.abs(np.nan_to_num(reduced["channel_rotation_rate"].values)) / 360.0
     bands = np.log(reduced["frequency"].values)
-    out = np.empty((len(expected), *found.shape), np.complex128)
+    density = np.empty((len(expected), *found.shape))
     for place, harmonic in enumerate(reduced["harmonic"].values):
         folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
         at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
         low = np.minimum(at.astype(int), bands.size - 2)
         block = np.arange(turning.size)
-        density = expected[:, :, block, low] * (1.0 - (at - low)) + expected[:, :, block, low + 1] * (at - low)
-        noise = rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
-        out[..., place] = np.sqrt(2.0 * density * rate / samples) * noise
+        density[..., place] = expected[:, :, block, low] * (1.0 - (at - low)) + expected[:, :, block, low + 1] * (at - low)
+    noise = rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
+    out = np.asarray(np.sqrt(2.0 * noise_at_orders(reduced, density) * rate / samples[..., None]) * noise)
     out[..., np.isnan(found)] = np.nan
     return out
 

@@ -15,7 +15,7 @@ from gyrostab.diagnose.effects.search import hops_within
 from gyrostab.diagnose.gains.levels import level_gains
 from gyrostab.diagnose.naming.claims import Claim, Unknown
 from gyrostab.diagnose.naming.filters import on_all_axes
-from gyrostab.diagnose.naming.jumps import sudden
+from gyrostab.diagnose.naming.jumps import levels, stays, sudden
 from gyrostab.diagnose.naming.steady import always_there
 from gyrostab.diagnose.reduction.reduced import measured
 from gyrostab.diagnose.reduction.zero_cell import may_be_cut_off
@@ -63,7 +63,8 @@ def possible(parts: Sequence[Part], state: State, *, error: float = 0.0) -> list
 
     `error` is what errors of the form of all else that is named may leave to the effect [nats].
     """
-    return [part for part in parts if _possible(part, state)] if on_all_axes(parts, state) and sudden(parts, state, error=error) else []
+    whole = on_all_axes(parts, state) and sudden(parts, state, error=error) and stays(parts, state) and levels(parts, state)
+    return [part for part in parts if _possible(part, state)] if whole else []
 
 
 def plainer_effect(parts: Sequence[Part], state: State) -> str | None:
@@ -102,6 +103,8 @@ def _possible(part: Part, state: State) -> bool:
         return bool(np.abs(part_mixture(part, state).moments()[0]).max() <= LARGEST[effect])
     if view == "mean" and not _in_range(part, state):
         return False
+    if view == "power" and not _from_least(part, state):
+        return False
     if view == "levels" and _more_levels(part, state):
         return False
     if not always_there(part, state):
@@ -117,6 +120,19 @@ def _in_range(part: Part, state: State) -> bool:
     sizes, covariance = part_mixture(part, state).moments()
     least = np.abs(sizes) - _SURE * np.sqrt(np.diagonal(covariance))
     return all(size <= largest.get(name, np.inf) for name, size in zip(part.variant.columns, least, strict=True))
+
+
+def _from_least(part: Part, state: State) -> bool:
+    """Whether the size of a level of the noise lies above the least that the registry allows: what ages does not get better."""
+    from gyrostab.diagnose.effects.sizes import part_size
+
+    if part.variant.squared or len(part.variant.columns) != 1:
+        return True
+    least = {item.name: item.low for item in effects()[part.candidate.effect].parameters()}.get(part.variant.columns[0])
+    if least is None or not np.isfinite(least):
+        return True
+    size, error = part_size(part, state)
+    return size >= least - _SURE * error
 
 
 def _more_levels(part: Part, state: State) -> bool:

@@ -1,4 +1,4 @@
-"""Negative controls: the channel that an effect follows, slid in time, must not explain as much as the channel itself."""
+"""Negative controls: the channel or axis that an effect follows, slid in time, must not explain as much as the channel itself."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ __all__ = ["SLIDES", "beats_slides"]
 SLIDES = 200
 _ALIKE = 0.5  # correlation from which on a slid design is too much like the true one
 _FEWEST = 20
+_OF_AXES = ("misalignment",)  # effects that follow the means of other axes
 
 
 def beats_slides(parts: Sequence[Part], state: State, folds: xr.DataArray, *, share: float = 0.01) -> tuple[bool, float]:
@@ -44,7 +45,7 @@ def beats_slides(parts: Sequence[Part], state: State, folds: xr.DataArray, *, sh
     p_value : float
         Share of the copies that did as well; NaN where there are too few copies that differ.
     """
-    own = [part for part in parts if part.candidate.view in ("mean", "power") and any(part.candidate.driver)]
+    own = [part for part in parts if _follows(part, state)]
     if not own:
         return True, np.nan
     blocks = state.reduced.sizes["block"]
@@ -69,6 +70,13 @@ def beats_slides(parts: Sequence[Part], state: State, folds: xr.DataArray, *, sh
     return p_value <= share, p_value
 
 
+def _follows(part: Part, state: State) -> bool:
+    """Whether a part follows a channel in means or powers, or the means of other axes."""
+    if part.candidate.view not in ("mean", "power"):
+        return False
+    return any(part.candidate.driver) or (part.candidate.view == "mean" and part.candidate.effect in _OF_AXES)
+
+
 def _slid(part: Part, state: State, shift: int) -> Variant | None:
     """The variant with its channels slid around the record."""
     candidate: Candidate = part.candidate
@@ -76,6 +84,8 @@ def _slid(part: Part, state: State, shift: int) -> Variant | None:
     for name in filter(None, candidate.driver):
         for key in {f"channel_{name}", f"fine_{name}"} & set(map(str, reduced.data_vars)):
             reduced[key] = reduced[key].copy(data=np.roll(reduced[key].values, shift, axis=0))
+    for key in {"mean", "measured_mean"} & set(map(str, reduced.data_vars)) if candidate.effect in _OF_AXES else ():
+        reduced[key] = reduced[key].copy(data=np.roll(reduced[key].values, shift, axis=list(reduced[key].dims).index("block")))
     made = variants_of(candidate, part.variant, reduced, state.baseline["coefficient"])
     return made
 

@@ -29,6 +29,8 @@ FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
 #: Pieces of a block over which the axes are averaged.
 PIECES = 16
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
+_BESIDE = (1, 5)  # turns in a block, from and below, beside those of the tool, where the noise about an order is measured
+_APART = 0.9  # turns in a block, that these are away from what was taken off
 _GAP_S = 1.0  # shorter gaps are not listed
 _FOR_LATTICE, _KEPT = 64, 2**16  # blocks whose values are kept; of each axis, about
 
@@ -78,6 +80,7 @@ class Accumulator:
         self.turn_carry: float | None = None
         self.turns = 0.0
         self.order = np.full((self.axes, blocks, len(HARMONICS)), np.nan + 0j) if self.turning else None
+        self.order_level = np.full(self.order.shape, np.nan) if self.order is not None else None
         self.ramp = self.beside.index("ramp") + self.axes if "ramp" in self.beside else None
         self.ramp_range = _range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
         if self.ramp_range[0] >= self.ramp_range[1]:
@@ -226,22 +229,49 @@ class Accumulator:
     def _orders(self, part: slice, centred: Array) -> None:
         assert self.turning is not None
         assert self.order is not None
+        assert self.order_level is not None
         index = np.arange(part.start * self.length, part.stop * self.length)
         rotation, self.turn_carry = channel_at(self.turning, grid_times(self.start, self.rate, index), self.turn_carry)
         inside = rotation * self.turning_factor / (360.0 * self.rate)
         edges = np.cumsum(np.concatenate([[self.turns], inside]))
         self.turns = math.fmod(float(edges[-1]), 1.0)
         turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
-        turned = np.abs(np.diff(edges).reshape(turns.shape).sum(axis=-1)) >= 1.0
+        often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
+        turned = np.abs(often) >= 1.0
         counts = self.counts[: self.axes, part, 0]
         enough = turned & (counts >= max(_POWER_SHARE * self.length, 2))
-        one = np.exp(-2j * math.pi * turns)
-        wheel = np.ones_like(one)
-        for number in range(len(HARMONICS)):
-            wheel = wheel * one
-            with np.errstate(invalid="ignore", divide="ignore"):
+        wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
+        present, left = centred != 0.0, centred  # missing samples count as zero
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for number, wheel in enumerate(wheels):
                 value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
-            self.order[:, part, number] = np.where(enough, value, np.nan)
+                self.order[:, part, number] = np.where(enough, value, np.nan)
+                left = left - np.where(present, (value[..., None] * np.conj(wheel)).real, 0.0)
+            for number, wheel in enumerate(wheels):
+                level = _power_beside(left * wheel, often, HARMONICS[number]) / (counts * self.rate)
+                self.order_level[:, part, number] = np.where(enough, level, np.nan)
+
+
+def _power_beside(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
+    """Mean power (axis, block) of what turns a few times in the block more or less than a harmonic, NaN where nothing tells it.
+
+    Places at which the mean of the block or a harmonic was taken off, or would be seen in the mirror, do not count.
+
+    Parameters
+    ----------
+    turned : ndarray, shape (axis, block, sample)
+        Samples without the harmonics, by the wheel of this one.
+    often : ndarray, shape (block,)
+        Turns of the tool in the block, negative where it turns back.
+    harmonic : int
+    """
+    beside = np.concatenate([-np.arange(*_BESIDE)[::-1], np.arange(*_BESIDE)])
+    power = np.abs(np.fft.fft(turned, axis=-1)[..., beside]) ** 2
+    place = np.abs(harmonic * often[:, None] + beside)
+    taken = np.abs(often)[:, None, None] * np.array([0, *HARMONICS])
+    free = (np.abs(place[..., None] - taken) >= _APART).all(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
 
 
 def _swap(found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:

@@ -20,7 +20,7 @@ from gyrostab.timegrid import grid_index, grid_times
 from gyrostab.units import INNER
 from gyrostab.windows import duration_seconds, samples
 
-__all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "reduce_log"]
+__all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "noise_at_orders", "reduce_log"]
 
 Array = NDArray[np.float64]
 _BLOCK_S, _FEWEST, _MOST, _LEAST_SAMPLES, _MUST = 20.0, 90, 6000, 100, 24
@@ -29,6 +29,7 @@ _FOR_STEP = 256  # values of a block that tell the step of the lattice
 _MEAN_SHARE = 0.1  # of a block that must be present for its mean
 _POWER = "degree2 hour-2 Hz-1"
 _RATE = INNER["rate"]
+_LOUDER = 2.0  # times the expected density, beyond which what is measured beside an order is no chance
 
 
 def block_samples(size: int, rate: float, block: Any = None) -> int:
@@ -112,7 +113,7 @@ def reduce_log(
         and of these ``stuck`` and ``filled``. By
         ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the ``shape`` of its gamma distribution. ``cross``,
         ``cross_shape`` (pair, block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
-        ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order(axis, block, harmonic)``,
+        ``witness_cross``, ``line_power(axis, part, line)``, ``line_weight``, ``order`` and ``order_level`` (axis, block, harmonic),
         ``profile(axis, block, phase)``, ``piece_mean`` and ``piece_samples`` (axis, block, inner), ``lattice(axis)``,
         ``cell_width(axis, cell)`` [steps of the lattice], ``axes_at_once(subset, axis)``, ``at_once(subset, block)``,
         ``channel_<name>(block)``, ``fine_<name>(block, piece)`` of what effects follow late, and the gaps and restarts in seconds.
@@ -155,6 +156,24 @@ def reduce_log(
 def measured(reduced: xr.Dataset, name: str) -> xr.DataArray:
     """A variable of the reduced record as the axes measured it, with what of it is left out because they moved."""
     return reduced[f"measured_{name}"] if f"measured_{name}" in reduced else reduced[name]
+
+
+def noise_at_orders(reduced: xr.Dataset, expected: Array) -> Array:
+    """Density of the noise about the orders of the rotation: the expected one, or what turns almost as often where that is surely more.
+
+    Waves in the recording that have nothing to do with the tool, as those of the ground, are as loud at an order as beside it.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        From `reduce_log`.
+    expected : ndarray, shape (..., axis, block, harmonic)
+        [degree2 hour-2 Hz-1]
+    """
+    if "order_level" not in reduced:
+        return expected
+    beside = reduced["order_level"].transpose("axis", "block", "harmonic").values
+    return np.where(beside > _LOUDER * expected, beside, expected)
 
 
 def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:
@@ -311,6 +330,8 @@ def _locked(work: Accumulator) -> dict[str, Any]:
     if work.order is not None:
         attrs = _named("complex amplitude at multiples of the tool's rotation, NaN below one turn in the block", _RATE)
         found["order"] = (("axis", "block", "harmonic"), work.order, attrs)
+        level = _named("density of what turns 1 to 4 times in the block more or less than that, two-sided", _POWER)
+        found["order_level"] = (("axis", "block", "harmonic"), work.order_level, level)
     if work.profile_sums is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
             profile = work.profile_sums / work.profile_counts

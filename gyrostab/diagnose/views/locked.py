@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.reduction.reduced import noise_at_orders
 from gyrostab.diagnose.views.cells import (
     Array,
     Windows,
@@ -88,6 +89,7 @@ def _orders(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tupl
     with np.errstate(divide="ignore", invalid="ignore"):
         for axis, block in np.ndindex(spectrum.shape[:2]):
             density[axis, block] = np.exp(np.interp(at[block], bands, np.log(spectrum[axis, block])))
+        density = noise_at_orders(reduced, density)
         variance = 4.0 * density * rate / samples[..., None]  # of |order|^2 / 1: two components of 2 S rate / n each
         there = np.isfinite(order) & np.isfinite(variance) & (variance > 0) & (turning > 0.5 / float(reduced.attrs["block_s"]))[:, None]
         weight = np.where(there, 1.0 / variance, 0.0)
