@@ -1,6 +1,6 @@
 """From files to product, against merely reading the files: NetCDF (int32, zstd), Zarr (int32, blosc) and CSV, with 1 and 2 workers.
 
-    python benchmarks/end_to_end.py --hours 12 --output docs/performance.md
+    python benchmarks/end_to_end.py --output docs/performance.md
 
 Prints a Markdown table, and puts it into its place in a page. Every figure is the best of some runs, each in a process of its own that
 is warm: kernels compiled, files in the cache of the system. Beside the time on the clock stands the processor time of all threads,
@@ -29,8 +29,8 @@ TARGETS = {"nc": 2.0, "zarr": 2.0, "csv": 1.5}
 def main() -> None:
     """Make the archives, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--hours", type=float, default=12.0, help="length of the NetCDF and Zarr archives")
-    parser.add_argument("--csv-hours", type=float, default=3.0, help="length of the CSV archive")
+    parser.add_argument("--hours", type=float, default=48.0, help="length of the NetCDF and Zarr archives")
+    parser.add_argument("--csv-hours", type=float, default=12.0, help="length of the CSV archive")
     parser.add_argument("--rate", type=float, default=400.0)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS))
