@@ -116,7 +116,9 @@ def part_mixture(part: Part, state: State, variant: Variant | None = None, *, va
     mean = covariance @ moved
     log_weight = 0.5 * mean @ moved - 0.5 * np.linalg.slogdet(normal)[1]
     scale = size[:own]
-    return Mixture(np.array([log_weight]), (mean[:own] / scale)[None], (covariance[:own, :own] / np.outer(scale, scale))[None])
+    with np.errstate(over="ignore"):  # of a column that is nowhere but 0 the record says nothing: its variance is infinite
+        own_covariance = covariance[:own, :own] / np.outer(scale, scale)
+    return Mixture(np.array([log_weight]), (mean[:own] / scale)[None], own_covariance[None])
 
 
 def part_size(part: Part, state: State) -> tuple[float, float]:
