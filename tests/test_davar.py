@@ -103,7 +103,7 @@ class TestKernels:
         lags, sizes, first = rng.integers(1, 40, count + 2), rng.integers(0, longest, count), int(rng.integers(0, 9))
         splits = rng.integers(0, sizes + 1)
         used = lags[2:]
-        theta = np.full(first + longest + 2 * used.max() + LANES, np.nan)  # what no term needs may be anything
+        theta = np.full(first + longest + 2 * used.max() + 2 * LANES, np.nan)  # what no term needs may be anything
         end = first + (sizes + 2 * used).max()
         theta[first:end] = rng.standard_normal(end - first)
         out = np.full(2 * count, 7.0)

@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.vectors import TOGETHER, split_sums
+from gyrostab.kernels.vectors import IN_A_ROW, TOGETHER, split_sums
 
 __all__ = ["full_counts", "grouped_blocks", "groups", "windows_from_blocks"]
 
@@ -27,13 +27,20 @@ __all__ = ["full_counts", "grouped_blocks", "groups", "windows_from_blocks"]
 _TILE = 2048
 
 
-def groups(shifts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """First averaging factor of each group that goes through the angle together (one shift, `TOGETHER` at most), and the end."""
+def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """First averaging factor of each group that goes through the angle together, and the end.
+
+    The factors of a group have one shift; there are `TOGETHER` of them at most, or `IN_A_ROW` that follow each other.
+    """
     starts = np.flatnonzero(np.diff(shifts)) + 1
+    lags = ks >> shifts
     first: list[int] = []
-    for begin, end in zip([0, *starts], [*starts, shifts.size], strict=True):
-        first.extend(range(begin, end, TOGETHER))
-        if (end - begin) % TOGETHER == 1 and end - begin > TOGETHER:
+    for at, end in zip([0, *starts], [*starts, shifts.size], strict=True):
+        while at + IN_A_ROW <= end and lags[at + IN_A_ROW - 1] - lags[at] == IN_A_ROW - 1:
+            first.append(at)
+            at += IN_A_ROW
+        first.extend(range(at, end, TOGETHER))
+        if (end - at) % TOGETHER == 1 and end - at > TOGETHER:
             first[-1] -= 1  # two and a few rather than one alone
     return np.array([*first, shifts.size])
 
@@ -69,7 +76,7 @@ def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_l
     head_counts, tail_counts = np.zeros((n_counted, ks.size)), np.zeros((n_counted, ks.size))
     near = np.zeros(groups.size, np.int64)
     lags = ks >> shifts
-    splits, sizes, out = np.empty(TOGETHER, np.int64), np.empty(TOGETHER, np.int64), np.empty(2 * TOGETHER)
+    splits, sizes, out = np.empty(IN_A_ROW, np.int64), np.empty(IN_A_ROW, np.int64), np.empty(2 * IN_A_ROW)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
     for block in range(n_blocks):
         a = block * step

@@ -271,4 +271,4 @@ def pyramid_places(n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int6
             size = (size + 1) // 2
             shift += 1
         begin[i] = place
-    return begin, int(place + size + 2 * apart + LANES)
+    return begin, int(place + size + 2 * apart + 2 * LANES)

@@ -69,20 +69,20 @@ class Unit(NamedTuple):
 
 @njit(**KERNEL)
 def _fill(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[no-untyped-def]
-    """Cells from sums of squares; `counts` is empty where nothing is missing."""
+    """Cells from sums of squares; `counts` is empty where nothing is missing. No term leaves no sum, and 0 / 0 is NaN."""
+    scale = 2.0 * (ks * interval) * (ks * interval)
     for j in range(sums.shape[0]):
+        used = counts[j] if counts.size > 0 else full[j]
+        divisor = full[j] if zero_fill else used
         for i in range(ks.size):
-            count = full[j, i] if counts.size == 0 else counts[j, i]
-            divisor = full[j, i] if zero_fill else count
-            span = ks[i] * interval
-            cells[0, j, i] = sums[j, i] / (2.0 * span * span * divisor) if divisor > 0 else np.nan
-            cells[1, j, i] = count
-            cells[2, j, i] = count / full[j, i]
-            cells[3, j, i] = 1.0
-            cells[4, j, i] = STRICT
-            cells[5, j, i] = 1.0
-            cells[6, j, i] = 1.0
-            cells[7, j, i] = 1.0
+            cells[0, j, i] = sums[j, i] / (scale[i] * divisor[i])
+        for i in range(ks.size):
+            cells[1, j, i] = used[i]
+        for i in range(ks.size):
+            cells[2, j, i] = used[i] / full[j, i]
+        cells[3, j] = 1.0
+        cells[4, j] = STRICT
+        cells[5:8, j] = 1.0
 
 
 @njit(**KERNEL)
@@ -171,7 +171,7 @@ def _strict_sums(angle: _Angle, unit: Unit, n_windows: int, gaps: bool) -> tuple
             angle.flat, angle.rest, angle.places, starts, stops, unit.angle, unit.step, unit.ks, unit.shifts, rest, whole, n_windows
         )
     else:
-        runs, order = (angle.starts, angle.stops), (unit.ks, unit.shifts, groups(unit.shifts))
+        runs, order = (angle.starts, angle.stops), (unit.ks, unit.shifts, groups(unit.ks, unit.shifts))
         heads, tails, head_counts, tail_counts = grouped_blocks(
             angle.flat, angle.places, *runs, unit.step, *order, rest, whole, n_windows, gaps
         )
