@@ -64,21 +64,21 @@ def _limit(i, count, first, high, stop, step, block, n_windows, ks, shifts, head
 
 
 @njit(**KERNEL)
-def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, counted):  # type: ignore[no-untyped-def]
-    """Heads and tails of every block and averaging factor, (n_blocks, n_tau), and their numbers of terms if `counted`.
+def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, out):  # type: ignore[no-untyped-def]
+    """Heads and tails of every block and averaging factor, and their numbers of terms, into `out` (2 or 4, n_blocks, n_tau).
 
     `starts`, `stops` are runs of present points of the angle; ``flat[places[i]:]`` is the angle thinned by ``2**shifts[i]``;
-    `whole` is not rising.
+    `whole` is not rising; there are ``n_windows + whole[0]`` blocks.
     """
-    n_blocks = n_windows + whole[0]
-    n_counted = n_blocks if counted else 0
-    heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
-    head_counts, tail_counts = np.zeros((n_counted, ks.size)), np.zeros((n_counted, ks.size))
+    n_blocks = out.shape[1]
+    counted = out.shape[0] > 2
+    heads, tails = out[0].reshape(-1), out[1].reshape(-1)
     near = np.zeros(groups.size, np.int64)
     lags = ks >> shifts
-    splits, sizes, out = np.empty(IN_A_ROW, np.int64), np.empty(IN_A_ROW, np.int64), np.empty(2 * IN_A_ROW)
+    splits, sizes = np.empty(IN_A_ROW, np.int64), np.empty(IN_A_ROW, np.int64)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
     for block in range(n_blocks):
+        out[:, block] = 0.0
         a = block * step
         for sub in range(a, a + step, _TILE):
             for g in range(groups.size - 1):
@@ -96,14 +96,12 @@ def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_l
                     first = (low + (1 << shift) - 1) >> shift
                     count = groups[g + 1] - i
                     if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
-                        split_sums(flat, places[i] + first, count, lags, i, splits, sizes, out)
-                        for q in range(count):
-                            heads[block, i + q] += out[q]
-                            tails[block, i + q] += out[count + q]
-                            if counted:
-                                head_counts[block, i + q] += splits[q]
-                                tail_counts[block, i + q] += sizes[q] - splits[q]
-    return heads, tails, head_counts, tail_counts
+                        place = block * ks.size + i
+                        split_sums(flat, places[i] + first, count, lags, i, splits, sizes, heads, tails, place)
+                        if counted:
+                            for q in range(count):
+                                out[2, block, i + q] += splits[q]
+                                out[3, block, i + q] += sizes[q] - splits[q]
 
 
 @njit(**INNER)
@@ -129,9 +127,8 @@ def _slide(heads, tails, length, first, stop, out):  # type: ignore[no-untyped-d
 
 
 @njit(**KERNEL)
-def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-untyped-def]
+def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-def]
     """``out[j, i] = sum(heads[j : j + whole[i], i] + tails[...]) + heads[j + whole[i], i]``, additions only."""
-    out = np.empty((n_windows, whole.size))
     first = np.int64(0)
     while first < whole.size:
         stop = first + 1
@@ -140,11 +137,10 @@ def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-unty
         if whole[first] > 0:
             _slide(heads, tails, whole[first], first, stop, out)
         else:
-            for j in range(n_windows):
+            for j in range(out.shape[0]):
                 for i in range(first, stop):
                     out[j, i] = heads[j, i]
         first = stop
-    return out
 
 
 def full_counts(window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:

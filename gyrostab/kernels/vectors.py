@@ -129,18 +129,18 @@ def _totals(builder: Any, sums: list[list[Any]]) -> Any:
     return vectors[0]
 
 
-def _all_totals(builder: Any, sums: list[list[Any]]) -> list[Any]:
-    """Sums of all elements of any number of vectors, eight at a time."""
-    found = []
-    for begin in range(0, len(sums), LANES):
-        some = sums[begin : begin + LANES]
-        totals = _totals(builder, [some[place % len(some)] for place in range(LANES)])  # what is left over is filled with any
-        found.extend(builder.extract_element(totals, ir.Constant(_SHORT, place)) for place in range(len(some)))
-    return found
+def _all_totals(builder: Any, heads: list[list[Any]], tails: list[list[Any]]) -> list[Any]:
+    """Sums of all elements of each vector, as one vector for the heads and one for the tails."""
+    count = len(heads)
+    if 2 * count > LANES:
+        return [_totals(builder, sums) for sums in (heads, tails)]
+    both = heads + tails
+    found = _totals(builder, [both[place % len(both)] for place in range(LANES)])  # what is left over is filled with any
+    return [builder.shuffle_vector(found, found, _places(list(range(begin, begin + count)))) for begin in (0, count)]
 
 
 def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: list[Any], *, in_a_row: bool) -> list[Any]:
-    """Sums of every lag over ``m < split``, then those over ``split <= m < size``."""
+    """Vector with the sum of every lag over ``m < split``, and that over ``split <= m < size``."""
     steps = 1 if in_a_row else _STEPS[len(lags)]
     differences = _differences_in_a_row if in_a_row else _differences
     nothing = ir.Constant(_DOUBLES, [0.0] * LANES)
@@ -176,31 +176,27 @@ def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: l
                 _add_square(builder, heads[lag][0], value, where=before)
                 _add_square(builder, tails[lag][0], value, where=builder.and_(inside, builder.not_(before)))
             builder.store(advanced(LANES), position)
-    return _all_totals(builder, heads + tails)
+    return _all_totals(builder, heads, tails)
 
 
 def _of_lags(count: int, *, in_a_row: bool = False) -> Any:
     """The loop for `count` lags as a function for compiled code, arguments as `split_sums`."""
 
-    def sums(typing_context, theta, first, lags, at, splits, sizes, out):  # type: ignore[no-untyped-def]
+    def sums(typing_context, theta, first, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            starts = [
-                context.make_array(kind)(context, builder, value).data
-                for kind, value in zip(signature.args, args, strict=True)
-                if isinstance(kind, types.Array)
+            arrays = zip(signature.args, args, strict=True)
+            starts = [context.make_array(kind)(context, builder, value).data for kind, value in arrays if isinstance(kind, types.Array)]
+            theta, lags = builder.gep(starts[0], [args[1]]), builder.gep(starts[1], [args[3]])
+            values = [
+                [builder.load(builder.gep(start, [ir.Constant(_INDEX, i)])) for i in range(count)] for start in (lags, starts[2], starts[3])
             ]
-            theta, integers, out = builder.gep(starts[0], [args[1]]), starts[1:4], starts[4]
-            integers[0] = builder.gep(integers[0], [args[3]])
-
-            def place(start: Any, i: int) -> Any:
-                return builder.gep(start, [ir.Constant(_INDEX, i)])
-
-            values = [[builder.load(place(start, i)) for i in range(count)] for start in integers]
-            for i, total in enumerate(_loop(builder, theta, *values, in_a_row=in_a_row)):
-                builder.store(total, place(out, i))
+            some = ir.VectorType(ir.DoubleType(), count).as_pointer()
+            for total, start in zip(_loop(builder, theta, *values, in_a_row=in_a_row), starts[4:], strict=True):
+                row = builder.bitcast(builder.gep(start, [args[8]]), some)
+                builder.store(builder.fadd(builder.load(row, align=8), total), row, align=8)
             return context.get_dummy_value()
 
-        return types.void(theta, types.int64, lags, types.int64, splits, sizes, out), generate
+        return types.void(theta, types.int64, lags, types.int64, splits, sizes, heads, tails, types.int64), generate
 
     return intrinsic(sums)
 
@@ -210,8 +206,8 @@ _eight_in_a_row, _four_in_a_row = (_of_lags(count, in_a_row=True) for count in (
 
 
 @njit(**KERNEL)
-def split_sums(theta, first, count, lags, at, splits, sizes, out):  # type: ignore[no-untyped-def]
-    """Sums of squared second differences of one to four lags, or of eight that follow each other, from one place on, in two parts.
+def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
+    """Add squared second differences of one to four lags, or of eight that follow each other, from one place on, in two parts.
 
     Parameters
     ----------
@@ -226,18 +222,18 @@ def split_sums(theta, first, count, lags, at, splits, sizes, out):  # type: igno
         Averaging factors, rising, used from number `at` on.
     splits, sizes : int64 (count,)
         Terms of the head, ``m < split``; terms of head and tail, ``split <= m < size``.
-    out : float64 (2 * count,)
-        Overwritten: heads, then tails.
+    heads, tails, place : float64 (n,), float64 (n,), int
+        Sums of the two parts, to which is added, from number `place` on.
     """
     if count == 8:
-        _eight_in_a_row(theta, first, lags, at, splits, sizes, out)
+        _eight_in_a_row(theta, first, lags, at, splits, sizes, heads, tails, place)
     elif count == 4 and lags[at + 3] - lags[at] == 3:
-        _four_in_a_row(theta, first, lags, at, splits, sizes, out)
+        _four_in_a_row(theta, first, lags, at, splits, sizes, heads, tails, place)
     elif count == 4:
-        _four(theta, first, lags, at, splits, sizes, out)
+        _four(theta, first, lags, at, splits, sizes, heads, tails, place)
     elif count == 3:
-        _three(theta, first, lags, at, splits, sizes, out)
+        _three(theta, first, lags, at, splits, sizes, heads, tails, place)
     elif count == 2:
-        _two(theta, first, lags, at, splits, sizes, out)
+        _two(theta, first, lags, at, splits, sizes, heads, tails, place)
     else:
-        _one(theta, first, lags, at, splits, sizes, out)
+        _one(theta, first, lags, at, splits, sizes, heads, tails, place)
