@@ -25,6 +25,9 @@ __all__ = ["full_counts", "grouped_blocks", "groups", "windows_from_blocks"]
 
 # Points of the angle in one pass: what several averaging factors read of them stays in the first-level cache.
 _TILE = 2048
+# Points whose blocks a group of averaging factors takes one after the other, so that the processor can foresee where its loops end:
+# with the sums of these blocks they stay in the second-level cache.
+_FORESEEN = 16384
 
 
 def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -76,32 +79,33 @@ def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_l
     near = np.zeros(groups.size, np.int64)
     lags = ks >> shifts
     splits, sizes = np.empty(IN_A_ROW, np.int64), np.empty(IN_A_ROW, np.int64)
+    together = max(1, _FORESEEN // step)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
-    for block in range(n_blocks):
-        out[:, block] = 0.0
-        a = block * step
-        for sub in range(a, a + step, _TILE):
+    for begin in range(0, n_blocks, together):
+        out[:, begin : begin + together] = 0.0
+        for tile in range(0, step, _TILE):
             for g in range(groups.size - 1):
                 i = groups[g]
+                count = groups[g + 1] - i
                 shift = shifts[i]
-                if (sub - a) & ((_TILE << shift) - 1):
+                if tile & ((_TILE << shift) - 1):
                     continue
-                high = min(sub + (_TILE << shift), a + step)
-                while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= sub:
-                    near[g] += 1
-                for r in range(near[g], stops.size):
-                    if starts[r] >= high:
-                        break
-                    low = max(sub, starts[r])
-                    first = (low + (1 << shift) - 1) >> shift
-                    count = groups[g + 1] - i
-                    if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
-                        place = block * ks.size + i
-                        split_sums(flat, places[i] + first, count, lags, i, splits, sizes, heads, tails, place)
-                        if counted:
-                            for q in range(count):
-                                out[2, block, i + q] += splits[q]
-                                out[3, block, i + q] += sizes[q] - splits[q]
+                for block in range(begin, min(begin + together, n_blocks)):
+                    low = block * step + tile
+                    high = min(low + (_TILE << shift), (block + 1) * step)
+                    place = block * ks.size + i
+                    while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= low:
+                        near[g] += 1
+                    for r in range(near[g], stops.size):
+                        if starts[r] >= high:
+                            break
+                        first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
+                        if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
+                            split_sums(flat, places[i] + first, count, lags, i, splits, sizes, heads, tails, place)
+                            if counted:
+                                for q in range(count):
+                                    out[2, block, i + q] += splits[q]
+                                    out[3, block, i + q] += sizes[q] - splits[q]
 
 
 @njit(**INNER)
