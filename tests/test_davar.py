@@ -14,9 +14,12 @@ from hypothesis import strategies as st
 from gyrostab.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places
+from gyrostab.kernels.surface import Unit, surface_unit
 from gyrostab.kernels.vectors import IN_A_ROW, LANES, split_sums
+from gyrostab.kernels.workspace import Workspace
 from gyrostab.log import make_log
 from gyrostab.schema import ESTIMATORS
+from gyrostab.windows import thin
 from tests.reference import direct_angle_surface, direct_surface
 
 STRICT, WEIGHTED = ESTIMATORS.index("strict_runs"), ESTIMATORS.index("weighted_clusters")
@@ -40,6 +43,8 @@ def records(draw):
     window = draw(st.integers(4, n))
     step = draw(st.integers(1, window))
     ks = sorted(draw(st.sets(st.integers(1, window // 2), min_size=1, max_size=6)))
+    if draw(st.booleans()):  # these share their loads
+        ks = list(range(ks[0], min(ks[0] + draw(st.integers(4, 21)), window // 2 + 1)))
     dtype = draw(st.sampled_from([np.float64, np.float32, np.int32]))
     if dtype is np.int32:  # integers have no missing samples
         x = np.clip(np.round(np.where(np.isfinite(x), x, 0)), -(2**30), 2**30)
@@ -141,6 +146,22 @@ class TestKernels:
         for place, shift in zip(places, shifts, strict=True):
             want = theta[:: 2**shift]
             np.testing.assert_array_equal(flat[place : place + want.size], want)
+
+    def test_memory_that_others_have_used_changes_no_bit(self):
+        rng, space = np.random.default_rng(4), Workspace()
+        whole, broken = rng.standard_normal((2, 30_000))
+        broken[rng.random(30_000) < 0.02] = np.nan
+        broken[4000] = 1e9  # kept as two doubles
+        for x, angle, octave, n_tau in [
+            (whole, False, False, 60),
+            (broken, False, True, 20),
+            (broken, True, False, 30),
+            (whole, False, True, 9),
+        ]:
+            ks = np.arange(1, n_tau + 1) * 8 if octave else np.arange(1, n_tau + 1)
+            unit = Unit(1000, 300, ks, thin(ks) if octave else np.zeros_like(ks), angle, 0.01, False, 0.3, 0.1)
+            for fresh, used in zip(surface_unit(x, unit), surface_unit(x, unit, space), strict=True):
+                np.testing.assert_array_equal(fresh, used)
 
 
 class TestAgainstPeers:
