@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from gyrostab.davar import davar
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places
+from gyrostab.kernels.blocks import held_points
+from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places, thin_pyramid
 from gyrostab.kernels.surface import Unit, surface_unit
 from gyrostab.kernels.vectors import IN_A_ROW, LANES, split_sums
 from gyrostab.kernels.workspace import Workspace
@@ -99,6 +100,21 @@ class TestAgainstTheDefinition:
         np.testing.assert_array_equal(result["count"].values[0], count)
         np.testing.assert_allclose(result["avar"].values[0], avar, rtol=1e-12)
 
+    @pytest.mark.parametrize("octave", [False, True])
+    @pytest.mark.parametrize(("window", "step", "longest"), [(3000, 700, 1408), (150_000, 75_000, 20_480)])
+    def test_a_unit_that_is_longer_than_the_angle_it_holds(self, window, step, longest, octave):
+        rng = np.random.default_rng(5)
+        x = rng.standard_normal(350_000) + 7.0
+        for start in rng.integers(0, x.size, 40):
+            x[start : start + 90] = np.nan
+        ks = np.array([1, 2, 3, 4, 5, 6, 7, 8, 9, 24, 160, longest])
+        shifts = thin(ks) if octave else np.zeros_like(ks)
+        assert held_points(x.size + 1, step, ks, shifts) < x.size / 1.4
+        cells, _ = surface_unit(x, Unit(window, step, ks, shifts, False, 0.01, False, 0.0, 0.0))
+        avar, count = direct_surface(x, window, step, list(ks), shifts=list(shifts))
+        np.testing.assert_array_equal(cells[1], count)
+        np.testing.assert_allclose(cells[0], avar, rtol=1e-10)
+
 
 class TestKernels:
     @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.booleans(), st.integers(1, 200))
@@ -140,7 +156,8 @@ class TestKernels:
         shifts = np.array([0, 0, 1, 4])
         places, size = pyramid_places(n + 1, np.array([1, 2, 16, 160]), shifts)
         flat = np.empty(size)
-        largest = integrate(x, 1.0, starts, stops, flat, 4)
+        largest = integrate(x, 1.0, starts, stops, flat[: n + 1])
+        thin_pyramid(flat, n + 1, 4, 0, n + 1)
         theta = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(x), x - 1.0, 0.0))])
         assert largest == np.abs(theta).max()
         for place, shift in zip(places, shifts, strict=True):

@@ -19,15 +19,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.integrate import TILE, integrate_tile, thin_pyramid
 from gyrostab.kernels.vectors import IN_A_ROW, TOGETHER, split_sums
 
-__all__ = ["full_counts", "grouped_blocks", "groups", "windows_from_blocks"]
+__all__ = ["full_counts", "grouped_blocks", "groups", "held_points", "windows_from_blocks"]
 
-# Points of the angle in one pass: what several averaging factors read of them stays in the first-level cache.
-_TILE = 2048
-# Points whose blocks a group of averaging factors takes one after the other, so that the processor can foresee where its loops end:
-# with the sums of these blocks they stay in the second-level cache.
-_FORESEEN = 16384
+# Points that a group of averaging factors goes through before the next one does: so few that they stay in the second-level cache, so many
+# that the processor can foresee where the loops of short blocks end.
+_STRETCH = 65536
 
 
 def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -66,46 +65,117 @@ def _limit(i, count, first, high, stop, step, block, n_windows, ks, shifts, head
     return largest
 
 
+@njit(**INNER)
+def _add_stretch(  # type: ignore[no-untyped-def]
+    flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups, head_lengths, whole, n_windows,
+    near, splits, sizes, out,
+):  # fmt: skip
+    """Add what the blocks from `begin` to `end` have behind `tile` samples, `_STRETCH` of each at most; `near`: the first runs in reach."""
+    heads, tails = out[0].reshape(-1), out[1].reshape(-1)
+    # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
+    for g in range(groups.size - 1):
+        i = groups[g]
+        count = groups[g + 1] - i
+        shift = shifts[i]
+        for block in range(begin, end):
+            low = block * step + tile
+            high = min(low + _STRETCH, (block + 1) * step)
+            while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= low:
+                near[g] += 1
+            for r in range(near[g], stops.size):
+                if starts[r] >= high:
+                    break
+                first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
+                if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
+                    place = places[i] + first - (base >> shift)
+                    split_sums(flat, place, count, lags, i, splits, sizes, heads, tails, block * ks.size + i)
+                    if out.shape[0] > 2:
+                        for q in range(count):
+                            out[2, block, i + q] += splits[q]
+                            out[3, block, i + q] += sizes[q] - splits[q]
+
+
+@njit(**INNER)
+def _move_to_front(flat, capacity, levels, by, held):  # type: ignore[no-untyped-def]
+    """Move the points from `by` to `held` of ``flat[:capacity]`` to its beginning, and those of the thinned levels behind it."""
+    place, size = 0, capacity
+    for level in range(levels + 1):
+        shift = np.int64(by >> level)
+        part = flat[place : place + ((held - 1) >> level) + 1]
+        for m in range(part.size - shift):
+            part[m] = part[m + shift]
+        place += size
+        size = (size + 1) // 2
+
+
+def held_points(n_points: int, step: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> int:
+    """Points of the angle that `grouped_blocks` needs room for: what its terms reach twice over, and no more than there are."""
+    whole = 1 << int(shifts.max(initial=0))
+    wanted = 4 * int(ks[-1]) + 2 * max(step, _STRETCH) + TILE + whole
+    return -(-min(wanted, n_points) // whole) * whole
+
+
 @njit(**KERNEL)
-def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, out):  # type: ignore[no-untyped-def]
+def grouped_blocks(  # type: ignore[no-untyped-def]
+    x, offset, flat, capacity, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, out
+):  # fmt: skip
     """Heads and tails of every block and averaging factor, and their numbers of terms, into `out` (2 or 4, n_blocks, n_tau).
 
-    `starts`, `stops` are runs of present points of the angle; ``flat[places[i]:]`` is the angle thinned by ``2**shifts[i]``;
-    `whole` is not rising; there are ``n_windows + whole[0]`` blocks.
+    The angle is integrated as the blocks need it, and of what has been integrated only so much is held that it stays in the cache.
+
+    Parameters
+    ----------
+    x : ndarray (n,)
+        Rates, or nothing where `flat` holds the angle already.
+    offset : float
+        Taken from each rate.
+    flat, capacity, places : float64, int, int64 (n_tau,)
+        Room for so many points of the angle (see `held_points`) and their thinned levels (see `pyramid_places`); where the level of each
+        averaging factor begins.
+    starts, stops : int64 (n_runs,)
+        Runs of present points of the angle, one more each than of present rates.
+    step, ks, shifts, groups, head_lengths, whole, n_windows
+        Samples of a block; averaging factors, their thinning (`flat` holds the angle thinned by ``2**shifts[i]``) and groups; terms of a
+        head; blocks of a window, not rising; windows: there are ``n_windows + whole[0]`` blocks.
+    out : float64 (2 or 4, n_blocks, n_tau)
+        Overwritten.
+
+    Returns
+    -------
+    float
+        Largest magnitude of the angle that was integrated.
     """
     n_blocks = out.shape[1]
-    counted = out.shape[0] > 2
-    heads, tails = out[0].reshape(-1), out[1].reshape(-1)
-    near = np.zeros(groups.size, np.int64)
+    near, ends = np.zeros(groups.size, np.int64), stops - 1
     lags = ks >> shifts
     splits, sizes = np.empty(IN_A_ROW, np.int64), np.empty(IN_A_ROW, np.int64)
-    together = max(1, _FORESEEN // step)
-    # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
+    levels, together = shifts[-1], max(1, _STRETCH // step)
+    base = done = run = np.int64(0)
+    total = largest = 0.0
+    if x.size > 0:
+        flat[0] = 0.0
+        thin_pyramid(flat, capacity, levels, base, base + 1)
     for begin in range(0, n_blocks, together):
-        out[:, begin : begin + together] = 0.0
-        for tile in range(0, step, _TILE):
-            for g in range(groups.size - 1):
-                i = groups[g]
-                count = groups[g + 1] - i
-                shift = shifts[i]
-                if tile & ((_TILE << shift) - 1):
-                    continue
-                for block in range(begin, min(begin + together, n_blocks)):
-                    low = block * step + tile
-                    high = min(low + (_TILE << shift), (block + 1) * step)
-                    place = block * ks.size + i
-                    while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= low:
-                        near[g] += 1
-                    for r in range(near[g], stops.size):
-                        if starts[r] >= high:
-                            break
-                        first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
-                        if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
-                            split_sums(flat, places[i] + first, count, lags, i, splits, sizes, heads, tails, place)
-                            if counted:
-                                for q in range(count):
-                                    out[2, block, i + q] += splits[q]
-                                    out[3, block, i + q] += sizes[q] - splits[q]
+        end = min(begin + together, n_blocks)
+        out[:, begin:end] = 0.0
+        for tile in range(0, step, _STRETCH):
+            first = begin * step + tile
+            needed = min((end - 1) * step + min(tile + _STRETCH, step) + 2 * ks[-1], x.size)
+            while done < needed:
+                b = min(done + TILE, x.size)
+                if b + 1 - base > capacity:
+                    by = (first >> levels << levels) - base
+                    _move_to_front(flat, capacity, levels, by, done + 1 - base)
+                    base += by
+                total, reached, run = integrate_tile(x, offset, starts, ends, done, b, total, run, flat[done - base : b + 1 - base])
+                largest = max(largest, reached)
+                thin_pyramid(flat, capacity, levels, done + 1 - base, b + 1 - base)
+                done = b
+            _add_stretch(
+                flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups, head_lengths, whole, n_windows,
+                near, splits, sizes, out,
+            )  # fmt: skip
+    return largest
 
 
 @njit(**INNER)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.blocks import full_counts, grouped_blocks, groups, windows_from_blocks
+from gyrostab.kernels.blocks import full_counts, grouped_blocks, groups, held_points, windows_from_blocks
 from gyrostab.kernels.clusters import cluster_cells, cluster_factor, cluster_strides, integrate_places, pack_mask
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.integrate import (
@@ -125,15 +125,12 @@ def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells): 
                 cells[7, j, i] = bridged[j, 5]
 
 
-class _Angle(NamedTuple):
-    """Angle of a unit: every level of thinning in one array, where each begins, the remainders (or nothing), runs of present points."""
+class _Present(NamedTuple):
+    """Runs of present samples, and what is taken from each rate."""
 
-    flat: Floats
-    rest: Floats
-    places: Integers
-    points: int
     starts: Integers
     stops: Integers
+    offset: float
 
 
 def _line_removed(x: NDArray[np.generic], starts: Integers, stops: Integers) -> Floats:
@@ -144,40 +141,64 @@ def _line_removed(x: NDArray[np.generic], starts: Integers, stops: Integers) -> 
     return np.where(np.isfinite(values), values - line, 0.0)
 
 
-def _angle(x: NDArray[np.generic], unit: Unit, starts: Integers, stops: Integers, offset: float, space: Workspace) -> _Angle:
-    """Local angle of the unit, for rates the integral of ``x - offset``."""
-    points = x.size + (0 if unit.angle else 1)
-    places, size = pyramid_places(points, unit.ks, unit.shifts)
-    flat, rest = space.array("angle", size), np.empty(0)
-    levels = int(unit.shifts.max(initial=0))
-    if unit.angle:
-        flat[:points] = _line_removed(x, starts, stops)
-        thin_pyramid(flat, points, levels, 0, points)
-    elif needs_two_doubles(integrate(x, offset, starts, stops, flat, levels), x):
-        rest = space.array("rest of the angle", size)
-        integrate_two(x, offset, starts, stops, flat[:points], rest[:points])
-        thin_pyramid(flat, points, levels, 0, points)
-        thin_pyramid(rest, points, levels, 0, points)
-    return _Angle(flat, rest, places, points, starts, stops if unit.angle else stops + 1)
-
-
-def _strict_sums(angle: _Angle, unit: Unit, n_windows: int, gaps: bool, space: Workspace) -> tuple[Floats, Floats]:
+def _strict_sums(
+    x: NDArray[np.generic], unit: Unit, present: _Present, n_windows: int, gaps: bool, space: Workspace
+) -> tuple[Floats, Floats]:
     """Sums of squared second differences of every window and averaging factor, and numbers of terms (empty where all are there)."""
     lengths = unit.window - 2 * unit.ks + 1
     whole = lengths // unit.step
     rest = lengths - whole * unit.step
     blocks = space.array("blocks", 4 if gaps else 2, n_windows + int(whole[0]), unit.ks.size)
-    if angle.rest.size or (unit.angle and angle.starts.size > 1):
-        starts, stops = angle.starts, angle.stops if unit.angle else angle.stops - 1
-        single = (angle.flat, angle.rest, angle.places, starts, stops, unit.angle, unit.step, unit.ks, unit.shifts, rest, whole, n_windows)
-        blocks[:] = single_blocks(*single)[: len(blocks)]
-    else:
-        order = (unit.ks, unit.shifts, groups(unit.ks, unit.shifts))
-        grouped_blocks(angle.flat, angle.places, angle.starts, angle.stops, unit.step, *order, rest, whole, n_windows, blocks)
+    add = _angle_blocks if unit.angle else _rate_blocks
+    add(x, unit, present, (rest, whole, n_windows), blocks, space)
     sums = space.array("sums", len(blocks) // 2, n_windows, unit.ks.size)
     for heads_and_tails, out in zip((blocks[:2], blocks[2:]), sums, strict=False):
         windows_from_blocks(*heads_and_tails, whole, out)
     return sums[0], sums[1] if gaps else np.empty((0, 0))
+
+
+def _rate_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tuple[Any, ...], blocks: Floats, space: Workspace) -> None:
+    """Heads and tails of rates, from an angle that is held as far as terms reach; or, where that is too large, from one of two doubles."""
+    starts, stops, offset = present
+    ks, shifts = unit.ks, unit.shifts
+    points = held_points(x.size + 1, unit.step, ks, shifts)
+    places, size = pyramid_places(points, ks, shifts)
+    flat = space.array("angle", size)
+    runs, order = (starts, stops + 1), (ks, shifts, groups(ks, shifts))
+    largest = grouped_blocks(x, offset, flat, points, places, *runs, unit.step, *order, *cut, blocks)
+    if not needs_two_doubles(largest, x):
+        return
+    places, size = pyramid_places(x.size + 1, ks, shifts)
+    high, low = space.array("angle", size), space.array("rest of the angle", size)
+    integrate_two(x, offset, starts, stops, high[: x.size + 1], low[: x.size + 1])
+    for part in (high, low):
+        thin_pyramid(part, x.size + 1, int(shifts[-1]), 0, x.size + 1)
+    blocks[:] = single_blocks(high, low, places, starts, stops, unit.angle, unit.step, ks, shifts, *cut)[: len(blocks)]
+
+
+def _angle_of(x: NDArray[np.generic], present: _Present, windows: Integers, unit: Unit, space: Workspace) -> Floats:
+    """Angle of all samples, (n + 1,), that has its values from the first of some windows to the block behind the last of them."""
+    first, last = windows[0] * unit.step, min((windows[-1] + 1) * unit.step + unit.window, x.size)
+    angle = space.array("angle", x.size + 1)
+    starts, stops = (np.clip(edges, first, last) - first for edges in present[:2])
+    some = starts < stops
+    integrate(x[first:last], present.offset, starts[some], stops[some], angle[first : last + 1])
+    return angle
+
+
+def _angle_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tuple[Any, ...], blocks: Floats, space: Workspace) -> None:
+    """Heads and tails of angles, which are all there already."""
+    starts, stops, _ = present
+    ks, shifts = unit.ks, unit.shifts
+    places, size = pyramid_places(x.size, ks, shifts)
+    flat = space.array("angle", size)
+    flat[: x.size] = _line_removed(x, starts, stops)
+    thin_pyramid(flat, x.size, int(shifts[-1]), 0, x.size)
+    if starts.size > 1:
+        blocks[:] = single_blocks(flat, flat[:0], places, starts, stops, unit.angle, unit.step, ks, shifts, *cut)[: len(blocks)]
+    else:
+        order = (ks, shifts, groups(ks, shifts))
+        grouped_blocks(np.empty(0), 0.0, flat, x.size, places, starts, stops, unit.step, *order, *cut, blocks)
 
 
 def _native(x: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -195,19 +216,20 @@ def surface_unit(x: NDArray[np.generic], unit: Unit, space: Workspace | None = N
     unit : Unit
         Window, step, averaging factors and rules.
     space : Workspace, optional
-        Memory to work in, for units one after the other.
+        Memory to work in, for units one after the other; what the last one returned is overwritten.
 
     Returns
     -------
     cells : ndarray (8, n_windows, n_tau)
-        The fields of `CELL_FIELDS`; the variance is in the square of the rate's unit (for angles: of angle per second).
+        The fields of `CELL_FIELDS`, in the memory of `space`; the variance is in the square of the rate's unit (for angles: of angle
+        per second).
     means : ndarray (2, n_windows)
         As `window_means`.
     """
     counts_only = np.issubdtype(x.dtype, np.integer)
     x, space = _native(x), space or Workspace()
     n_windows = _number_of_windows(x, unit)
-    cells = np.empty((len(CELL_FIELDS), n_windows, unit.ks.size))
+    cells = space.array("cells", len(CELL_FIELDS), n_windows, unit.ks.size)
     means, mean, known = _means(x, unit, n_windows)
     present = int(known.sum())
     if present == 0:
@@ -217,8 +239,7 @@ def surface_unit(x: NDArray[np.generic], unit: Unit, space: Workspace | None = N
     gaps = present < x.size
     starts, stops = present_runs(x, unit.step if known.size > 1 else x.size, known) if gaps else (np.zeros(1, np.int64), np.full(1, x.size))
     offset = float(np.rint(mean)) if counts_only else mean  # integers less an integer: every sum is exact
-    angle = _angle(x, unit, starts, stops, offset, space)
-    sums, counts = _strict_sums(angle, unit, n_windows, gaps, space)
+    sums, counts = _strict_sums(x, unit, _Present(starts, stops, offset), n_windows, gaps, space)
     full = full_counts(unit.window, unit.step, n_windows, unit.ks, unit.shifts)
     _fill(sums, counts, full, unit.zero_fill, unit.ks, unit.interval if unit.angle else 1.0, cells)
     if gaps:
@@ -226,7 +247,8 @@ def surface_unit(x: NDArray[np.generic], unit: Unit, space: Workspace | None = N
         poor = counts < unit.min_strict * full
         if not unit.zero_fill and not unit.angle and poor.any():
             strides = cluster_strides(unit.window, unit.ks, unit.shifts)
-            _bridge_gaps(angle.flat[: angle.points], starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
+            angle = _angle_of(x, _Present(starts, stops, offset), np.flatnonzero(poor.any(axis=1)), unit, space)
+            _bridge_gaps(angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
     if gaps and not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
         cells[0][blank] = cells[5][blank] = cells[6][blank] = cells[7][blank] = np.nan
