@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import dask.array as da
 import numpy as np
 import pytest
@@ -322,6 +324,65 @@ def test_fast_fit_is_the_plain_fit(law, share, block):
         for row, name in enumerate(FIT_FIELDS[:-1]):
             np.testing.assert_allclose(result[w, row, there], plain[name][there], rtol=1e-6, atol=1e-12 * abs(plain[name]).max())
             np.testing.assert_allclose(result[w, row], plain[name], rtol=1e-4, atol=1e-7 * abs(plain[name]).max())
+
+
+def cells_of(x, **options):
+    """Arguments of `fit_windows` for independent windows, and the tables of `gyrostab.fit`."""
+    cells, ks, rate, window = fit._inputs(windows_of(x, **options))
+    return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
+
+
+def shared(tables, **changed):
+    names = ("columns", "to_samples", "pairs", "ramps", "weight")
+    return [changed.get(name, getattr(tables, name)) for name in names]
+
+
+def mixed_records(rng, trials):
+    """Every window another noise, so that fits side by side differ in their terms and in when they arrive."""
+    x = white(rng, trials, 3000, N=0.01, rate=RATE) * rng.choice([0.1, 1.0, 3.0], (trials, 1))
+    x += random_walk(rng, trials, 3000, K=400.0, rate=RATE) * rng.choice([0.0, 1.0], (trials, 1))
+    x += quantization(rng, trials, 3000, Q=0.4, rate=RATE) * rng.choice([0.0, 1.0], (trials, 1))
+    return x + rng.choice([0.0, 3000.0], (trials, 1)) * np.arange(3000) / RATE / 3600
+
+
+def test_a_window_has_the_same_fit_in_any_place_beside_any_other():
+    """Bit for bit: among others in another order, beside windows without cells, and beside ones whose numbers overflow."""
+    rng = np.random.default_rng(32)
+    flat, tables = cells_of(lose(rng, mixed_records(rng, 21), 0.2, 20), taus=21)
+    expected = fit_windows(*flat, *shared(tables), 31)
+    order = rng.permutation(21)
+    for got, want in zip(fit_windows(*[cell[order] for cell in flat], *shared(tables), 31), expected, strict=True):
+        np.testing.assert_array_equal(got, want[order])
+    spoiled = [cell.copy() for cell in flat]
+    spoiled[0][3::8] = np.nan
+    spoiled[0][5::8] *= 1e200
+    spoiled[0][6::8] *= 1e-200
+    left = np.flatnonzero(~np.isin(np.arange(21) % 8, (3, 5, 6)))
+    result, misfit, dof = fit_windows(*spoiled, *shared(tables), 31)
+    for got, want in zip((result, misfit, dof), expected, strict=True):
+        np.testing.assert_array_equal(got[left], want[left])
+    assert np.isnan(np.delete(result, left, axis=0)[:, 0]).all()
+    assert (misfit[6::8, 1] == 0).all()
+
+
+def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_must_be():
+    """Tables that are wrong by 2e-5 for random walks and right for all else; the plain fit widens window by window."""
+    rng = np.random.default_rng(33)
+    walks = random_walk(rng, 20, 3000, K=400.0, rate=RATE)
+    flat, tables = cells_of(np.where(np.arange(20)[:, None] % 3 == 1, walks, mixed_records(rng, 20)), taus=21)
+    pairs = tables.pairs.copy()
+    values, vectors = np.linalg.eigh(pairs[3, 3] / np.sqrt(np.outer(np.diag(pairs[3, 3]), np.diag(pairs[3, 3]))))
+    scale = np.sqrt(np.diag(pairs[3, 3]))
+    pairs[3, 3] -= (values[0] + 2e-5) * np.outer(vectors[:, 0] * scale, vectors[:, 0] * scale)
+    damaged = SimpleNamespace(**{**vars(tables), "pairs": pairs})
+    result, misfit, _ = fit_windows(*flat, *shared(tables, pairs=pairs), 31)
+    widened = 0
+    for w in range(20):
+        plain = fit_window_plainly(*(cell[w] for cell in flat), damaged)
+        assert misfit[w, 0] == pytest.approx(float(plain["chi2"]), rel=1e-4)
+        np.testing.assert_allclose(result[w, 0], plain["square"], rtol=1e-4, atol=1e-7 * abs(plain["square"]).max())
+        widened += plain["jitter"] > 1e-6
+    assert 2 < widened < 18
 
 
 def test_windows_are_fitted_alike_alone_and_together():
