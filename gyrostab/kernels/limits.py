@@ -108,6 +108,9 @@ def cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, 
                 if ks[i] * span[a] < ks[last]:
                     continue
                 quantile = whole[i, a]
+                most_promised = quantile if share <= 1.0 else 1.0  # fewer degrees of freedom have a lower quantile
+                if model >= lowest[a] * most_promised * seen[a]:
+                    continue
                 if a == 4:
                     quantile = _quantile(min(own_dof[a, i] * share, most, dof[w, i]), start, step, curve)
                 elif share != 1.0:
