@@ -100,7 +100,7 @@ def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
 
 def first_stamp(log: xr.Dataset) -> int:
     """Stamp of the first sample of a log [ns since 1970], without computing the others."""
-    first = np.asarray(log["time"].isel(time=0).values).astype("datetime64[ns]")
+    first = np.asarray(log.variables["time"][0].values).astype("datetime64[ns]")
     return int(first.astype(np.int64).ravel()[0])
 
 

@@ -53,7 +53,7 @@ def window_channels(
             continue
         stamps = None
         if channel.dims != ("time",):
-            stamps = channel[f"time_{name}"].values.astype("datetime64[ns]").astype(np.int64)
+            stamps = log.variables[f"time_{name}"].values.astype("datetime64[ns]", copy=False).view(np.int64)
 
         def ends(group: slice, stamps: NDArray[np.int64] | None = stamps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             first = np.arange(group.start, group.stop) * step
