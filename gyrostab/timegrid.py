@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,7 @@ def stamp_ns(start: Any, what: str = "start") -> int:
         raise OptionError(f"{what} {start!r} is not a date and time; write for instance 2026-11-20T14:00:00 (UTC)") from error
 
 
+@lru_cache(maxsize=64)
 def period_ns(rate: float) -> tuple[int, float]:
     """Whole and fractional nanoseconds of the sampling period of `rate` [Hz].
 

@@ -19,7 +19,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.fit import fit_noise
 from gyrostab.kernels.covariance import product_tables
 from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
-from gyrostab.kernels.limits import interpolate_quantile
+from gyrostab.kernels.limits import cell_limits, interpolate_quantile
 from gyrostab.kernels.nonnegative import solve_nonnegative
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.log import make_log
@@ -329,7 +329,9 @@ def test_fast_fit_is_the_plain_fit(law, share, block):
 def cells_of(x, **options):
     """Arguments of `fit_windows` for independent windows, and the tables of `gyrostab.fit`."""
     cells, ks, rate, window = fit._inputs(windows_of(x, **options))
-    return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
+    return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._tables(
+        tuple(ks.tolist()), (0,) * ks.size, rate, window
+    )
 
 
 def shared(tables, **changed):
@@ -407,6 +409,36 @@ def test_interpolated_quantile_is_that_of_scipy(quantile_curve, exponent):
     expected = chi2.ppf(0.05, freedom) / freedom
     got = interpolate_quantile(freedom, *quantile_curve)
     np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-250)
+
+
+@pytest.mark.parametrize("decades", [np.inf, 10.0])
+def test_limit_of_a_cell_is_the_least_that_the_model_promises_among_all_cells(quantile_curve, decades):
+    """Every cell tried with scipy's quantile; a term's own part cannot be more than the cell."""
+    rng = np.random.default_rng(34)
+    ks = np.round(np.geomspace(1, 1000, 25))
+    columns = ks[:, None] ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    squares = np.array([1.0, 0.3, 0.01, 1e-4, 1e-7]) * rng.choice([0.0, 0.1, 1.0, 10.0, np.nan], (40, 5))
+    own = rng.uniform(0.5, 2.0, (5, 25)) * 3000 / ks
+    own[4] = np.inf
+    white, quantization, ramp = rng.uniform(0.5, 1.5, (3, 40, 25))
+    factor = np.where(rng.random((40, 1)) < 0.5, 1.0, rng.uniform(0.1, 1.0, (40, 25)))
+    response = np.stack([quantization, white, *np.ones((2, 40, 25)), ramp], axis=-1)
+    part = response * columns
+    model = (part * np.nan_to_num(squares)[:, None]).sum(axis=-1)
+    dof = rng.uniform(1.0, 3000.0, (40, 25))
+    avar = model * rng.chisquare(dof) / dof
+    avar[rng.random((40, 25)) < 0.1] = np.nan
+    span = np.array([np.inf, *[decades] * 4])
+    got = cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, own, ks, span, 1e6, *quantile_curve)
+    freedom = np.minimum(own.T * factor[..., None], 1e6)
+    freedom[..., 4] = np.minimum(freedom[..., 4], dof)
+    reach = 1.0 / (chi2.ppf(0.05, freedom) / freedom * part)
+    for w in range(40):
+        seen = np.isfinite(avar[w])
+        for a in range(5):
+            able = np.flatnonzero(seen & (ks * span[a] >= ks[seen].max()))
+            best = able[np.argmin(model[w, able] * reach[w, able, a])]
+            assert got[w, a] == pytest.approx(avar[w, best] * reach[w, best, a], rel=1e-6)
 
 
 def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
