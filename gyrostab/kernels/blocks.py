@@ -19,21 +19,31 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.vectors import TOGETHER, split_sums
+from gyrostab.kernels.vectors import IN_A_ROW, TOGETHER, split_sums
 
 __all__ = ["full_counts", "grouped_blocks", "groups", "windows_from_blocks"]
 
 # Points of the angle in one pass: what several averaging factors read of them stays in the first-level cache.
 _TILE = 2048
+# Points whose blocks a group of averaging factors takes one after the other, so that the processor can foresee where its loops end:
+# with the sums of these blocks they stay in the second-level cache.
+_FORESEEN = 16384
 
 
-def groups(shifts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """First averaging factor of each group that goes through the angle together (one shift, `TOGETHER` at most), and the end."""
+def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """First averaging factor of each group that goes through the angle together, and the end.
+
+    The factors of a group have one shift; there are `TOGETHER` of them at most, or `IN_A_ROW` that follow each other.
+    """
     starts = np.flatnonzero(np.diff(shifts)) + 1
+    lags = ks >> shifts
     first: list[int] = []
-    for begin, end in zip([0, *starts], [*starts, shifts.size], strict=True):
-        first.extend(range(begin, end, TOGETHER))
-        if (end - begin) % TOGETHER == 1 and end - begin > TOGETHER:
+    for at, end in zip([0, *starts], [*starts, shifts.size], strict=True):
+        while at + IN_A_ROW <= end and lags[at + IN_A_ROW - 1] - lags[at] == IN_A_ROW - 1:
+            first.append(at)
+            at += IN_A_ROW
+        first.extend(range(at, end, TOGETHER))
+        if (end - at) % TOGETHER == 1 and end - at > TOGETHER:
             first[-1] -= 1  # two and a few rather than one alone
     return np.array([*first, shifts.size])
 
@@ -57,46 +67,45 @@ def _limit(i, count, first, high, stop, step, block, n_windows, ks, shifts, head
 
 
 @njit(**KERNEL)
-def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, counted):  # type: ignore[no-untyped-def]
-    """Heads and tails of every block and averaging factor, (n_blocks, n_tau), and their numbers of terms if `counted`.
+def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, out):  # type: ignore[no-untyped-def]
+    """Heads and tails of every block and averaging factor, and their numbers of terms, into `out` (2 or 4, n_blocks, n_tau).
 
     `starts`, `stops` are runs of present points of the angle; ``flat[places[i]:]`` is the angle thinned by ``2**shifts[i]``;
-    `whole` is not rising.
+    `whole` is not rising; there are ``n_windows + whole[0]`` blocks.
     """
-    n_blocks = n_windows + whole[0]
-    n_counted = n_blocks if counted else 0
-    heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
-    head_counts, tail_counts = np.zeros((n_counted, ks.size)), np.zeros((n_counted, ks.size))
+    n_blocks = out.shape[1]
+    counted = out.shape[0] > 2
+    heads, tails = out[0].reshape(-1), out[1].reshape(-1)
     near = np.zeros(groups.size, np.int64)
     lags = ks >> shifts
-    splits, sizes, out = np.empty(TOGETHER, np.int64), np.empty(TOGETHER, np.int64), np.empty(2 * TOGETHER)
+    splits, sizes = np.empty(IN_A_ROW, np.int64), np.empty(IN_A_ROW, np.int64)
+    together = max(1, _FORESEEN // step)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
-    for block in range(n_blocks):
-        a = block * step
-        for sub in range(a, a + step, _TILE):
+    for begin in range(0, n_blocks, together):
+        out[:, begin : begin + together] = 0.0
+        for tile in range(0, step, _TILE):
             for g in range(groups.size - 1):
                 i = groups[g]
+                count = groups[g + 1] - i
                 shift = shifts[i]
-                if (sub - a) & ((_TILE << shift) - 1):
+                if tile & ((_TILE << shift) - 1):
                     continue
-                high = min(sub + (_TILE << shift), a + step)
-                while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= sub:
-                    near[g] += 1
-                for r in range(near[g], stops.size):
-                    if starts[r] >= high:
-                        break
-                    low = max(sub, starts[r])
-                    first = (low + (1 << shift) - 1) >> shift
-                    count = groups[g + 1] - i
-                    if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
-                        split_sums(flat, places[i] + first, count, lags, i, splits, sizes, out)
-                        for q in range(count):
-                            heads[block, i + q] += out[q]
-                            tails[block, i + q] += out[count + q]
+                for block in range(begin, min(begin + together, n_blocks)):
+                    low = block * step + tile
+                    high = min(low + (_TILE << shift), (block + 1) * step)
+                    place = block * ks.size + i
+                    while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= low:
+                        near[g] += 1
+                    for r in range(near[g], stops.size):
+                        if starts[r] >= high:
+                            break
+                        first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
+                        if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
+                            split_sums(flat, places[i] + first, count, lags, i, splits, sizes, heads, tails, place)
                             if counted:
-                                head_counts[block, i + q] += splits[q]
-                                tail_counts[block, i + q] += sizes[q] - splits[q]
-    return heads, tails, head_counts, tail_counts
+                                for q in range(count):
+                                    out[2, block, i + q] += splits[q]
+                                    out[3, block, i + q] += sizes[q] - splits[q]
 
 
 @njit(**INNER)
@@ -122,9 +131,8 @@ def _slide(heads, tails, length, first, stop, out):  # type: ignore[no-untyped-d
 
 
 @njit(**KERNEL)
-def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-untyped-def]
+def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-def]
     """``out[j, i] = sum(heads[j : j + whole[i], i] + tails[...]) + heads[j + whole[i], i]``, additions only."""
-    out = np.empty((n_windows, whole.size))
     first = np.int64(0)
     while first < whole.size:
         stop = first + 1
@@ -133,11 +141,10 @@ def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-unty
         if whole[first] > 0:
             _slide(heads, tails, whole[first], first, stop, out)
         else:
-            for j in range(n_windows):
+            for j in range(out.shape[0]):
                 for i in range(first, stop):
                     out[j, i] = heads[j, i]
         first = stop
-    return out
 
 
 def full_counts(window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -179,10 +179,10 @@ def thin_pyramid(flat, n_points, levels, a, b):  # type: ignore[no-untyped-def]
     size = n_points
     for _ in range(levels):
         a, b = (a + 1) // 2, (b + 1) // 2
-        source = flat[place + 2 * a : place + min(size, 2 * b) : 2]
+        source = flat[place + 2 * a : place + min(size, 2 * b)]
         target = flat[place + size + a : place + size + b]
-        for i in range(target.size):
-            target[i] = source[i]
+        for i in range(np.uint64(target.size)):
+            target[i] = source[np.uint64(2) * i]
         place += size
         size = (size + 1) // 2
 
@@ -271,4 +271,4 @@ def pyramid_places(n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int6
             size = (size + 1) // 2
             shift += 1
         begin[i] = place
-    return begin, int(place + size + 2 * apart + LANES)
+    return begin, int(place + size + 2 * apart + 2 * LANES)
