@@ -338,8 +338,9 @@ def _assemble(
             out[f"{symbol}_squared"] = (plane, value**2, attributes(f"{symbol}_squared"))
     stack = da.stack if isinstance(observable[0], da.Array) else np.stack
     out["observable"] = ((*plane, "term"), stack(observable, axis=-1).astype(np.int8), attributes("observable"))
-    product = surface.assign({**out, **extra}).assign_coords(term=("term", list(TERMS), attributes("term")))
-    return product.assign_attrs(fit_method=method)
+    product = surface.assign({**out, **extra, "term": ("term", list(TERMS), attributes("term"))})
+    product.attrs["fit_method"] = method
+    return product
 
 
 _SQUARED = ("N_squared", "K_squared")

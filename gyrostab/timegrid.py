@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,7 @@ def stamp_ns(start: Any, what: str = "start") -> int:
         raise OptionError(f"{what} {start!r} is not a date and time; write for instance 2026-11-20T14:00:00 (UTC)") from error
 
 
+@lru_cache(maxsize=64)
 def period_ns(rate: float) -> tuple[int, float]:
     """Whole and fractional nanoseconds of the sampling period of `rate` [Hz].
 
@@ -100,7 +102,7 @@ def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
 
 def first_stamp(log: xr.Dataset) -> int:
     """Stamp of the first sample of a log [ns since 1970], without computing the others."""
-    first = np.asarray(log["time"].isel(time=0).values).astype("datetime64[ns]")
+    first = np.asarray(log.variables["time"][0].values).astype("datetime64[ns]")
     return int(first.astype(np.int64).ravel()[0])
 
 

@@ -96,7 +96,8 @@ def fit_window_plainly(
     """Iterated non-negative generalised least squares of one window with numpy's and scipy's solvers, without any thrift.
 
     Per term the squared coefficient, its standard error, its estimate free of sign, and the variance of that without the
-    term, its growth with the term and with the square of the term; chi-square. `tables` are those of `gyrostab.fit`.
+    term, its growth with the term and with the square of the term; chi-square; the share by which the variances had to be
+    widened at last for a covariance that is positive definite. `tables` are those of `gyrostab.fit`.
     """
     ok = np.isfinite(y) & (y > 0) & (factor > 0)
     y, white, quantization, ramp, factor = y[ok], white[ok], quantization[ok], ramp[ok], factor[ok]
@@ -122,8 +123,10 @@ def fit_window_plainly(
     squares = solve(np.diag(np.sqrt(weight) / (np.maximum.accumulate(y / design[:, 0]) * design[:, 0])))
     for _ in range(6):
         previous = squares
-        spread = covariance(squares)
-        whitener = np.linalg.inv(np.linalg.cholesky(spread + np.diag(1e-7 * np.diag(spread) + 1e-16 * y**2)))
+        spread, jitter = covariance(squares), 1e-7
+        while np.linalg.eigvalsh(spread + np.diag(jitter * np.diag(spread) + 1e-16 * y**2)).min() <= 0:
+            jitter *= 10
+        whitener = np.linalg.inv(np.linalg.cholesky(spread + np.diag(jitter * np.diag(spread) + 1e-16 * y**2)))
         squares = solve(whitener)
         if (abs(squares - previous) <= 1e-4 * previous).all():
             break
@@ -144,4 +147,4 @@ def fit_window_plainly(
         rows[a] = squares[a], error, estimator @ y, null, both - null - own, own
     names = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square")
     out = dict(zip(names, rows.T, strict=True))
-    return {**out, "chi2": np.asarray(np.sum((whitener @ (y - design @ squares)) ** 2))}
+    return {**out, "chi2": np.asarray(np.sum((whitener @ (y - design @ squares)) ** 2)), "jitter": np.asarray(jitter)}

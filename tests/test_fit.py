@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import dask.array as da
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.fit import fit_noise
 from gyrostab.kernels.covariance import product_tables
 from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
-from gyrostab.kernels.limits import interpolate_quantile
+from gyrostab.kernels.limits import cell_limits, interpolate_quantile
 from gyrostab.kernels.nonnegative import solve_nonnegative
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.log import make_log
@@ -324,6 +326,67 @@ def test_fast_fit_is_the_plain_fit(law, share, block):
             np.testing.assert_allclose(result[w, row], plain[name], rtol=1e-4, atol=1e-7 * abs(plain[name]).max())
 
 
+def cells_of(x, **options):
+    """Arguments of `fit_windows` for independent windows, and the tables of `gyrostab.fit`."""
+    cells, ks, rate, window = fit._inputs(windows_of(x, **options))
+    return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._tables(
+        tuple(ks.tolist()), (0,) * ks.size, rate, window
+    )
+
+
+def shared(tables, **changed):
+    names = ("columns", "to_samples", "pairs", "ramps", "weight")
+    return [changed.get(name, getattr(tables, name)) for name in names]
+
+
+def mixed_records(rng, trials):
+    """Every window another noise, so that fits side by side differ in their terms and in when they arrive."""
+    x = white(rng, trials, 3000, N=0.01, rate=RATE) * rng.choice([0.1, 1.0, 3.0], (trials, 1))
+    x += random_walk(rng, trials, 3000, K=400.0, rate=RATE) * rng.choice([0.0, 1.0], (trials, 1))
+    x += quantization(rng, trials, 3000, Q=0.4, rate=RATE) * rng.choice([0.0, 1.0], (trials, 1))
+    return x + rng.choice([0.0, 3000.0], (trials, 1)) * np.arange(3000) / RATE / 3600
+
+
+def test_a_window_has_the_same_fit_in_any_place_beside_any_other():
+    """Bit for bit: among others in another order, beside windows without cells, and beside ones whose numbers overflow."""
+    rng = np.random.default_rng(32)
+    flat, tables = cells_of(lose(rng, mixed_records(rng, 21), 0.2, 20), taus=21)
+    expected = fit_windows(*flat, *shared(tables), 31)
+    order = rng.permutation(21)
+    for got, want in zip(fit_windows(*[cell[order] for cell in flat], *shared(tables), 31), expected, strict=True):
+        np.testing.assert_array_equal(got, want[order])
+    spoiled = [cell.copy() for cell in flat]
+    spoiled[0][3::8] = np.nan
+    spoiled[0][5::8] *= 1e200
+    spoiled[0][6::8] *= 1e-200
+    left = np.flatnonzero(~np.isin(np.arange(21) % 8, (3, 5, 6)))
+    result, misfit, dof = fit_windows(*spoiled, *shared(tables), 31)
+    for got, want in zip((result, misfit, dof), expected, strict=True):
+        np.testing.assert_array_equal(got[left], want[left])
+    assert np.isnan(np.delete(result, left, axis=0)[:, 0]).all()
+    assert (misfit[6::8, 1] == 0).all()
+
+
+def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_must_be():
+    """Tables that are wrong by 2e-5 for random walks and right for all else; the plain fit widens window by window."""
+    rng = np.random.default_rng(33)
+    walks = random_walk(rng, 20, 3000, K=400.0, rate=RATE)
+    flat, tables = cells_of(np.where(np.arange(20)[:, None] % 3 == 1, walks, mixed_records(rng, 20)), taus=21)
+    pairs = tables.pairs.copy()
+    values, vectors = np.linalg.eigh(pairs[3, 3] / np.sqrt(np.outer(np.diag(pairs[3, 3]), np.diag(pairs[3, 3]))))
+    scale = np.sqrt(np.diag(pairs[3, 3]))
+    pairs[3, 3] -= (values[0] + 2e-5) * np.outer(vectors[:, 0] * scale, vectors[:, 0] * scale)
+    damaged = SimpleNamespace(**{**vars(tables), "pairs": pairs})
+    result, misfit, _ = fit_windows(*flat, *shared(tables, pairs=pairs), 31)
+    widened = 0
+    for w in range(20):
+        plain = fit_window_plainly(*(cell[w] for cell in flat), damaged)
+        assert misfit[w, 0] == pytest.approx(float(plain["chi2"]), rel=1e-4)
+        np.testing.assert_allclose(result[w, 0], plain["square"], rtol=1e-4, atol=1e-7 * abs(plain["square"]).max())
+        widened += plain["jitter"] > 1e-6
+    assert 2 < widened < 18
+
+
 def test_windows_are_fitted_alike_alone_and_together():
     x = np.random.default_rng(20).standard_normal((9, 2000))
     surface = windows_of(x, taus=21)
@@ -346,6 +409,36 @@ def test_interpolated_quantile_is_that_of_scipy(quantile_curve, exponent):
     expected = chi2.ppf(0.05, freedom) / freedom
     got = interpolate_quantile(freedom, *quantile_curve)
     np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-250)
+
+
+@pytest.mark.parametrize("decades", [np.inf, 10.0])
+def test_limit_of_a_cell_is_the_least_that_the_model_promises_among_all_cells(quantile_curve, decades):
+    """Every cell tried with scipy's quantile; a term's own part cannot be more than the cell."""
+    rng = np.random.default_rng(34)
+    ks = np.round(np.geomspace(1, 1000, 25))
+    columns = ks[:, None] ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    squares = np.array([1.0, 0.3, 0.01, 1e-4, 1e-7]) * rng.choice([0.0, 0.1, 1.0, 10.0, np.nan], (40, 5))
+    own = rng.uniform(0.5, 2.0, (5, 25)) * 3000 / ks
+    own[4] = np.inf
+    white, quantization, ramp = rng.uniform(0.5, 1.5, (3, 40, 25))
+    factor = np.where(rng.random((40, 1)) < 0.5, 1.0, rng.uniform(0.1, 1.0, (40, 25)))
+    response = np.stack([quantization, white, *np.ones((2, 40, 25)), ramp], axis=-1)
+    part = response * columns
+    model = (part * np.nan_to_num(squares)[:, None]).sum(axis=-1)
+    dof = rng.uniform(1.0, 3000.0, (40, 25))
+    avar = model * rng.chisquare(dof) / dof
+    avar[rng.random((40, 25)) < 0.1] = np.nan
+    span = np.array([np.inf, *[decades] * 4])
+    got = cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, own, ks, span, 1e6, *quantile_curve)
+    freedom = np.minimum(own.T * factor[..., None], 1e6)
+    freedom[..., 4] = np.minimum(freedom[..., 4], dof)
+    reach = 1.0 / (chi2.ppf(0.05, freedom) / freedom * part)
+    for w in range(40):
+        seen = np.isfinite(avar[w])
+        for a in range(5):
+            able = np.flatnonzero(seen & (ks * span[a] >= ks[seen].max()))
+            best = able[np.argmin(model[w, able] * reach[w, able, a])]
+            assert got[w, a] == pytest.approx(avar[w, best] * reach[w, best, a], rel=1e-6)
 
 
 def test_table_of_products_is_the_sum_over_all_pairs_of_terms():

@@ -21,6 +21,8 @@ from gyrostab.units import INNER
 __all__ = ["window_channels"]
 
 TEMPERATURE_RATE = "K hour-1"
+#: Values of a channel up to which those of all windows of a part are read at once.
+_TOGETHER = 2**20
 
 
 def window_channels(
@@ -53,7 +55,7 @@ def window_channels(
             continue
         stamps = None
         if channel.dims != ("time",):
-            stamps = channel[f"time_{name}"].values.astype("datetime64[ns]").astype(np.int64)
+            stamps = log.variables[f"time_{name}"].values.astype("datetime64[ns]", copy=False).view(np.int64)
 
         def ends(group: slice, stamps: NDArray[np.int64] | None = stamps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             first = np.arange(group.start, group.stop) * step
@@ -90,15 +92,18 @@ def _means(
     lazy = isinstance(data, da.Array) and part is None
     kept = slice(0, groups[-1].stop) if part is None else part
     chosen = [group for group in groups if group.start < kept.stop and group.stop > kept.start]
+    bounds = [ends(group) for group in chosen]
+    first, last = int(bounds[0][0][0]), int(bounds[-1][1][-1])
+    together = None if lazy or last - first > _TOGETHER else stretch(data, first, last)
     parts = []
-    for group in chosen:
-        a, b = ends(group)
+    for a, b in bounds:
         low, high = int(a[0]), int(b[-1])
         piece = None if stamps is None else stamps[low:high]
         if lazy:
             one = dask.delayed(_trend, pure=False)(data[low:high], piece, rate, a - low, b - low)
             parts.append(da.from_delayed(one, (2, a.size), dtype=np.float64))
         else:
-            parts.append(_trend(stretch(data, low, high), piece, rate, a - low, b - low))
+            values = stretch(data, low, high) if together is None else together[low - first : high - first]
+            parts.append(_trend(values, piece, rate, a - low, b - low))
     both = (da if lazy else np).concatenate(parts, axis=1)[:, kept.start - chosen[0].start : kept.stop - chosen[0].start]
     return both[0], both[1]

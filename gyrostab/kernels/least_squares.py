@@ -2,27 +2,34 @@
 
 The Allan variance is linear in the squared coefficients, so a window is ``y = X s + e`` with ``s >= 0``. Overlapping
 estimates at neighbouring averaging factors share data; the covariance of e follows from the noise itself
-(`gyrostab.kernels.covariance`), so it is taken from the fit and iterated.
+(`gyrostab.kernels.covariance`), so it is taken from the fit and iterated. Eight windows are fitted side by side
+(`gyrostab.kernels.eights`); each has the same numbers whatever its neighbours are.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.eight_solvers import back_substitute, eliminate, scale_equations, solve_nonnegative_eights, solve_terms
+from gyrostab.kernels.eights import PLACES, eights, put, root, take, where_above
 from gyrostab.kernels.mixture import (
     DATA,
-    LANES,
     PRODUCTS,
+    WIDTH,
     combine_products,
     covariance_rows,
     degrees_of_freedom,
     observe,
     root_squares,
+    root_units,
+    total_variance,
     variance_parts,
 )
-from gyrostab.kernels.nonnegative import REORDER, back_substitute, eliminate, solve_nonnegative, solve_subset
 
 __all__ = ["FIT_FIELDS", "fit_windows", "identify_noise"]
 
@@ -30,27 +37,90 @@ __all__ = ["FIT_FIELDS", "fit_windows", "identify_noise"]
 FIT_FIELDS = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square", "separation")
 
 
+class _Cells(NamedTuple):
+    """What `observe` says of eight windows."""
+
+    system: NDArray[np.float64]
+    seen: NDArray[np.float64]
+    inverse: NDArray[np.float64]
+    facts: NDArray[np.float64]
+
+
+class _Fit(NamedTuple):
+    """Eight fits: squared coefficients, the terms above zero, and those squares that the covariance was made of."""
+
+    squares: NDArray[np.float64]
+    terms: NDArray[np.float64]
+    basis: NDArray[np.float64]
+    #: Whether a fit still moves (row 0), was hopeless (1); its jitter (2), whether its covariance was positive definite (3).
+    state: NDArray[np.float64]
+
+
+class _Room(NamedTuple):
+    """Matrices and scratch of eight fits."""
+
+    units: NDArray[np.float64]
+    roots: NDArray[np.float64]
+    whole: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    right: NDArray[np.float64]
+    scratch: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
 @njit(**INNER)
-def _quick(system, weight, factor, normal, right, allowed, squares):  # type: ignore[no-untyped-def]
+def _make_cells(size):  # type: ignore[no-untyped-def]
+    return _Cells(eights(WIDTH * size), eights(WIDTH * size), eights(size), eights(6))
+
+
+@njit(**INNER)
+def _make_room(size):  # type: ignore[no-untyped-def]
+    units, roots, whole = eights(5 * size), eights(5 * size), eights(size * (size + WIDTH))
+    return _Room(units, roots, whole, eights(25), eights(5), eights(75), eights(size))
+
+
+@njit(**INNER)
+def _quick(cells, weight, allowed, normal, right, fit, scratch):  # type: ignore[no-untyped-def]
     """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise.
 
     No noise falls faster than quantization noise does. A cell that lies below the fall from a shorter averaging time
     is low by chance, and must not count for as much as its own square would have it.
     """
-    normal[:] = 0.0
-    right[:] = 0.0
-    level = 0.0
+    system, inverse, terms = cells.system, cells.inverse, fit.terms
+    for row in range(25):
+        put(normal, row, 0.0)
+    for a in range(5):
+        put(right, a, 0.0)
+        put(terms, a, 0.0)
+    level = take(inverse, 0) * 0.0
     for i in range(weight.size):
-        y = system[i, DATA]
-        if y == 0.0:
-            continue
-        level = max(level, y / system[i, 0])
-        w = weight[i] * factor[i] / (level * system[i, 0]) ** 2
-        for a in range(5):
-            right[a] += w * system[i, a] * y
-            for b in range(5):
-                normal[a, b] += w * system[i, a] * system[i, b]
-    return solve_nonnegative(normal, right, allowed, squares, np.int64(0))
+        y, first = take(system, WIDTH * i + DATA), take(system, WIDTH * i)
+        fall = where_above(y, 0.0, y / first, 0.0)
+        level = where_above(fall, level, fall, level)
+        expected = level * first
+        w = where_above(y, 0.0, weight[i] / (take(inverse, i) * expected * expected), 0.0)
+        _add_equation(system, WIDTH * i, w, normal, right)
+    _mirror(normal)
+    solve_nonnegative_eights(normal, right, allowed, terms, fit.squares, scratch)
+
+
+@njit(**INNER)
+def _add_equation(system, at, w, normal, right):  # type: ignore[no-untyped-def]
+    """Add a row of columns and data with weight `w` to normal equations, on and above their diagonal."""
+    y = take(system, at + DATA)
+    for a in range(5):
+        share = w * take(system, at + a)
+        put(right, a, take(right, a) + share * y)
+        for b in range(a, 5):
+            put(normal, 5 * a + b, take(normal, 5 * a + b) + share * take(system, at + b))
+
+
+@njit(**INNER)
+def _mirror(normal):  # type: ignore[no-untyped-def]
+    """Fill in what is below the diagonal of normal equations."""
+    for a in range(5):
+        for b in range(a):
+            put(normal, 5 * a + b, take(normal, 5 * b + a))
 
 
 @njit(**KERNEL)
@@ -74,7 +144,7 @@ def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_
     -------
     float64 (n_windows, n_tau)
     """
-    n_tau = avar.shape[1]
+    n_windows, n_tau = avar.shape
     out = np.full(avar.shape, np.nan)
     diagonal = np.empty((n_tau, PRODUCTS))
     for i in range(n_tau):
@@ -83,178 +153,213 @@ def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_
             for b in range(a, 5):
                 diagonal[i, table] = ramps[a, i] if b == 4 else pairs[a, b, i] * (1.0 if a == b else 2.0)
                 table += 1
-    squares = np.empty(5)
-    system, seen, inverse = np.empty((n_tau, LANES)), np.empty((6, n_tau)), np.empty(n_tau)
-    normal, right = np.empty((5, 5)), np.empty(5)
-    for w in range(avar.shape[0]):
-        if observe(avar[w], white[w], quantization[w], ramp[w], factor[w], columns, to_samples, system, seen, inverse):
-            _quick(system, weight, factor[w], normal, right, np.int64(31), squares)
+    cells, fit = _make_cells(n_tau), _Fit(eights(5), eights(5), eights(5), eights(4))
+    normal, right, scratch, squares = eights(25), eights(5), eights(75), np.empty(5)
+    for start in range(0, n_windows, PLACES):
+        _observe_eight(start, avar, white, quantization, ramp, factor, columns, to_samples, cells, np.empty(PLACES, np.int64))
+        _quick(cells, weight, np.int64(31), normal, right, fit, scratch)
+        for w in range(start, min(start + PLACES, n_windows)):
+            for a in range(5):
+                squares[a] = fit.squares[a, w - start]
             degrees_of_freedom(squares, avar[w], white[w], quantization[w], ramp[w], factor[w], columns, to_samples, diagonal, out[w])
             for i in range(n_tau):
-                if system[i, DATA] == 0.0:
+                if cells.system[WIDTH * i + DATA, w - start] == 0.0:
                     out[w, i] = np.nan
     return out
 
 
 @njit(**INNER)
-def _without(a, squares, system, first, last, trial):  # type: ignore[no-untyped-def]
+def _observe_eight(start, avar, white, quantization, ramp, factor, columns, to_samples, cells, valid):  # type: ignore[no-untyped-def]
+    """Describe the windows from number `start` on, beyond the last ones without cells; numbers of valid cells to `valid`."""
+    system, seen, inverse, facts = cells
+    for place in range(PLACES):
+        w = min(start + place, avar.shape[0] - 1)
+        end = avar.shape[1] if start + place < avar.shape[0] else 0
+        valid[place] = observe(
+            avar[w, :end], white[w], quantization[w], ramp[w], factor[w], columns, to_samples, place, system, seen, inverse, facts
+        )
+
+
+@njit(**INNER)
+def _factor_covariance(cells, fit, room, tables):  # type: ignore[no-untyped-def]
+    """Covariance of the noise `fit.basis` with columns and data beside it, eliminated; `fit.state` says where it is hopeless."""
+    system, inverse, whole, state = cells.system, cells.inverse, room.whole, fit.state
+    n = inverse.shape[0]
+    width = n + WIDTH
+    put(state, 2, 1e-7)  # the sums over lags are good to about this; a strong ramp may need more
+    root_squares(fit.basis, cells.seen, room.units, room.roots)
+    again = True
+    while again:
+        covariance_rows(room.roots, inverse, tables, whole, width)
+        jitter = take(state, 2)
+        for i in range(n):
+            at, y = width * i, take(system, WIDTH * i + DATA)
+            own = take(whole, at + i)  # the second part keeps a window without any noise solvable
+            put(whole, at + i, where_above(y, 0.0, own + jitter * own + 1e-16 * y * y, 1.0))
+            for a in range(WIDTH):
+                put(whole, at + n + a, take(system, WIDTH * i + a))
+        eliminate(whole, n, width, state[3:4])
+        again = False
+        for place in range(PLACES):
+            if state[3, place] < 0.5 and state[1, place] < 0.5:
+                state[2, place] *= 10.0
+                if state[2, place] < 1.0:
+                    again = True
+                else:
+                    state[1, place] = 1.0
+
+
+@njit(**INNER)
+def _normal_equations(whole, n, normal, right):  # type: ignore[no-untyped-def]
+    """Normal matrix and right-hand side from whitened columns and data beside an eliminated covariance."""
+    for row in range(25):
+        put(normal, row, 0.0)
+    for a in range(5):
+        put(right, a, 0.0)
+    one = take(whole, 0) * 0.0 + 1.0
+    for i in range(n):
+        _add_equation(whole, (n + WIDTH) * i + n, one, normal, right)
+    _mirror(normal)
+
+
+@njit(**INNER)
+def _refit(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
+    """Refit until the covariance is that of the fitted noise. A fit that has arrived keeps its numbers, and its matrices are made anew."""
+    squares, terms, basis, state, trial, tried = fit.squares, fit.terms, fit.basis, fit.state, eights(5), eights(5)
+    n = cells.inverse.shape[0]
+    put(state, 0, 1.0)
+    put(state, 1, 0.0)
+    for _ in range(6):
+        moves = take(state, 0)
+        for a in range(5):
+            put(basis, a, where_above(moves, 0.5, take(squares, a), take(basis, a)))
+            put(tried, a, take(terms, a))
+        _factor_covariance(cells, fit, room, tables)
+        _normal_equations(room.whole, n, room.normal, room.right)
+        solve_nonnegative_eights(room.normal, room.right, allowed, tried, trial, room.scratch)
+        moved = moves * 0.0
+        for a in range(5):
+            put(squares, a, where_above(moves, 0.5, take(trial, a), take(squares, a)))
+            put(terms, a, where_above(moves, 0.5, take(tried, a), take(terms, a)))
+            old, step = take(basis, a), take(squares, a) - take(basis, a)
+            moved = where_above(where_above(step, 0.0, step, 0.0 - step), 1e-4 * old, moves, moved)
+        put(state, 0, where_above(take(state, 1), 0.5, 0.0, moved))
+        if not _somewhere(state, np.int64(0)):
+            break
+
+
+@njit(**INNER)
+def _somewhere(rows, row):  # type: ignore[no-untyped-def]
+    """Whether one of the eight numbers of a row is above zero."""
+    found = False
+    for place in range(PLACES):
+        found = found or rows[row, place] > 0.0
+    return found
+
+
+@njit(**INNER)
+def _estimate(a, allowed, squares, terms, normal, right, scratch, row, found):  # type: ignore[no-untyped-def]
+    """Estimate of one term, free of sign beside the chosen ones; its weights on the right-hand sides to `row`.
+
+    Everything is NaN, and the separation zero, where the term cannot be told from the chosen ones.
+    """
+    scaled, work, scale, unit, tried = scratch[:25], scratch[25:50], scratch[50:55], scratch[55:60], scratch[60:65]
+    scale_equations(normal, scale, scaled)
+    for b in range(5):
+        put(unit, b, take(scale, b) if a == b else take(scale, b) * 0.0)
+        put(tried, b, 1.0 if allowed >> b & 1 else 0.0)
+    apart = solve_terms(scaled, unit, tried, row, work)
+    share = take(row, a) * take(scale, a) * take(normal, 6 * a)
+    separation = where_above(apart, 0.5, 1.0 / where_above(share, 1.0, share, 1.0), 0.0)
+    for b in range(5):
+        put(tried, b, take(terms, b))
+    put(tried, a, 1.0)
+    apart = solve_terms(scaled, unit, tried, row, work)
+    free = apart * 0.0
+    for b in range(5):  # row a of the inverse normal matrix: the estimator is the sum of row[b] right[b]
+        put(row, b, take(row, b) * take(scale, b))
+        free = free + take(row, b) * take(right, b)
+    variance = take(row, a)
+    put(found, 5 * 0 + a, where_above(apart, 0.5, take(squares, a), np.nan))
+    put(found, 5 * 1 + a, where_above(apart, 0.5, root(where_above(variance, 0.0, variance, 0.0)), np.nan))
+    put(found, 5 * 2 + a, where_above(apart, 0.5, free, np.nan))
+    put(found, 5 * 6 + a, where_above(apart, 0.5, separation, 0.0))
+    return apart
+
+
+@njit(**INNER)
+def _without(a, squares, facts, trial):  # type: ignore[no-untyped-def]
     """The noise if term `a` were not there and the neighbour most like it had made the same Allan variance instead.
 
     A ramp or a flicker floor is claimed only against a random walk that would reach as high at the longest averaging
     time, quantization against angle random walk at the shortest.
     """
-    for b in range(squares.size):
-        trial[b] = squares[b]
-    trial[a] = 0.0
-    cell, stand_in = last, -1
-    if a == 0:
-        cell, stand_in = first, 1
-    elif a == 2 or a == 4:
-        stand_in = 3
-    if stand_in >= 0:
-        trial[stand_in] += squares[a] * system[cell, a] / system[cell, stand_in]
-
-
-@njit(**INNER)
-def _growth(a, squares, system, seen, inverse, tables, root, weights, part, trial, result):  # type: ignore[no-untyped-def]
-    """Variance of the estimate of term `a` as a polynomial in its square: rows 3, 4 and 5 of `result`."""
-    first, last = 0, seen.shape[1] - 1
-    while system[first, DATA] == 0.0:
-        first += 1
-    while system[last, DATA] == 0.0:
-        last -= 1
-    _without(a, squares, system, first, last, trial)
-    parts = np.empty(3)
-    excess = 0.0
-    for i in range(seen.shape[1]):
-        excess = max(excess, seen[2, i])
-    if a > 1 or (a == 1 and trial[0] == 0.0) or excess == 0.0:
-        trial[a] = 1.0
-        root_squares(trial, seen, root)
-        variance_parts(root, a, inverse, tables, weights, part, parts)
-        for p in range(3):
-            result[3 + p, a] = parts[p]
-        return
-    # quantization noise that counts as white (see observe) makes the terms one; the growth is that of the first unit
-    root_squares(trial, seen, root)
-    variance_parts(root, np.int64(-1), inverse, tables, weights, part, parts)
-    result[3, a] = parts[0]
-    trial[a] = 1.0
-    root_squares(trial, seen, root)
-    variance_parts(root, np.int64(-1), inverse, tables, weights, part, parts)
-    both = parts[0]
     for b in range(5):
-        trial[b] = 1.0 if a == b else 0.0
-    root_squares(trial, seen, root)
-    variance_parts(root, np.int64(-1), inverse, tables, weights, part, parts)
-    result[5, a] = parts[0]
-    result[4, a] = both - result[3, a] - parts[0]
-
-
-@njit(fastmath=REORDER, **INNER)
-def _normal_equations(system, normal, right):  # type: ignore[no-untyped-def]
-    """Normal matrix and right-hand side from whitened columns and data."""
-    normal[:] = 0.0
-    right[:] = 0.0
-    for i in range(system.shape[0]):
-        for a in range(5):
-            right[a] += system[i, a] * system[i, DATA]
-            for b in range(5):
-                normal[a, b] += system[i, a] * system[i, b]
+        put(trial, b, take(squares, b))
+    put(trial, a, 0.0)
+    if a == 0 or a == 2 or a == 4:
+        stand_in = 1 if a == 0 else 3
+        put(trial, stand_in, take(trial, stand_in) + take(squares, a) * take(facts, a))
 
 
 @njit(**INNER)
-def _whiten(root, inverse, tables, system, whole, whitened):  # type: ignore[no-untyped-def]
-    """Whitened columns and data; False when the covariance is hopeless. `whole` keeps the factor of the covariance."""
-    n = root.shape[1]
-    jitter = 1e-7  # the sums over lags are good to about this; a strong ramp may need more
-    while jitter < 1.0:
-        covariance_rows(root, inverse, tables, whole)
-        for i in range(n):
-            if system[i, DATA] == 0.0:
-                whole[i, i] = 1.0
-            else:  # the second part keeps a window without any noise solvable
-                whole[i, i] += jitter * whole[i, i] + 1e-16 * system[i, DATA] ** 2
-            for a in range(LANES):
-                whole[i, n + a] = system[i, a]
-        if eliminate(whole):
-            for i in range(n):
-                for a in range(LANES):
-                    whitened[i, a] = whole[i, n + a]
-            return True
-        jitter *= 10.0
-    return False
+def _growth(a, apart, cells, fit, room, tables, found):  # type: ignore[no-untyped-def]
+    """Variance of the estimate of term `a` as a polynomial in its square, to rows 3, 4 and 5 of `found`."""
+    seen, inverse, units, roots, weights = cells.seen, cells.inverse, room.units, room.roots, room.weights
+    trial, parts = room.scratch[:5], room.scratch[5:8]
+    _without(a, fit.squares, cells.facts, trial)
+    root_squares(trial, seen, units, roots)
+    variance_parts(roots, a, units, inverse, tables, weights, parts)
+    if a < 2 and _somewhere(cells.facts, np.int64(5)):
+        _joint_growth(a, trial, cells, room, tables, parts)
+    for part in range(3):
+        put(found, 5 * (3 + part) + a, where_above(apart, 0.5, take(parts, part), np.nan))
 
 
 @njit(**INNER)
-def _estimate(a, chosen, allowed, normal, right, squares, row, work, members, result):  # type: ignore[no-untyped-def]
-    """Estimate of one term, free of sign beside the chosen ones; its weights on the right-hand sides to `row`.
-
-    Returns False when the term cannot be told from the chosen ones.
-    """
-    scale, unit, scaled, scratch = work[0], work[1], work[2:7], work[7:12]
+def _joint_growth(a, trial, cells, room, tables, parts):  # type: ignore[no-untyped-def]
+    """Quantization noise that counts as white (see `observe`) makes the terms one; the growth is that of the first unit."""
+    seen, inverse, units, roots, weights = cells.seen, cells.inverse, room.units, room.roots, room.weights
+    joint = take(cells.facts, 5)
+    if a == 1:
+        joint = where_above(take(trial, 0), 0.0, joint, 0.0)
+    null = take(parts, 0)
+    put(trial, a, 1.0)
+    root_squares(trial, seen, units, roots)
+    both = total_variance(roots, inverse, tables, weights)
     for b in range(5):
-        scale[b] = 1.0 / np.sqrt(normal[b, b]) if normal[b, b] > 0.0 else 0.0
-        unit[b] = scale[b] if a == b else 0.0
-    for b in range(5):
-        for c in range(5):
-            scaled[b, c] = normal[b, c] * scale[b] * scale[c]
-    result[6, a] = 0.0
-    if not solve_subset(scaled, unit, chosen | 1 << a, row, scratch, members):
-        return False
-    if solve_subset(scaled, unit, allowed, row, scratch, members):
-        result[6, a] = 1.0 / max(row[a] * scale[a] * normal[a, a], 1.0)
-    solve_subset(scaled, unit, chosen | 1 << a, row, scratch, members)
-    result[0, a] = squares[a]
-    result[2, a] = 0.0
-    for b in range(5):  # row a of the inverse normal matrix: the estimator is the sum of row[b] right[b]
-        row[b] *= scale[b]
-        result[2, a] += row[b] * right[b]
-    result[1, a] = np.sqrt(max(row[a], 0.0))
-    return True
+        put(trial, b, 1.0 if a == b else 0.0)
+    root_squares(trial, seen, units, roots)
+    alone = total_variance(roots, inverse, tables, weights)
+    put(parts, 1, where_above(joint, 0.0, both - null - alone, take(parts, 1)))
+    put(parts, 2, where_above(joint, 0.0, alone, take(parts, 2)))
 
 
 @njit(**INNER)
-def _iterate(system, seen, inverse, tables, allowed, chosen, squares, root, whole, whitened, normal, right):  # type: ignore[no-untyped-def]
-    """Refit `squares` until the covariance is that of the fitted noise; returns the terms above zero, -1 where it is hopeless."""
-    previous = np.empty(5)
-    for _ in range(6):
-        for a in range(5):
-            previous[a] = squares[a]
-        root_squares(squares, seen, root)
-        if not _whiten(root, inverse, tables, system, whole, whitened):
-            return -1
-        _normal_equations(whitened, normal, right)
-        chosen = solve_nonnegative(normal, right, allowed, squares, chosen)
-        moved = False
-        for a in range(5):
-            moved = moved or abs(squares[a] - previous[a]) > 1e-4 * previous[a]
-        if not moved:
-            break
-    return chosen
-
-
-@njit(**INNER)
-def _judge(chosen, allowed, squares, system, seen, inverse, tables, root, whole, whitened, normal, right, work, result):  # type: ignore[no-untyped-def]
-    """Estimates of all terms with their errors, separations and growing variances; returns chi-square."""
-    n = seen.shape[1]
-    row, part, weights, scratch, members = np.empty(5), work[0], work[1], np.empty((12, 5)), np.empty(5, np.int64)
-    for a in range(5):
-        if not allowed >> a & 1 or not _estimate(a, chosen, allowed, normal, right, squares, row, scratch, members, result):
-            continue
-        for i in range(n):
-            weights[i] = 0.0
-            for b in range(5):
-                weights[i] += row[b] * whitened[i, b]
-        back_substitute(whole, weights)  # estimator as weights on the cells
-        _growth(a, squares, system, seen, inverse, tables, root, weights, part, row, result)
-    chi2 = 0.0
+def _judge(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore[no-untyped-def]
+    """Estimates of all terms with their errors, separations and growing variances to `found`; chi-square."""
+    whole, weights, squares = room.whole, room.weights, fit.squares
+    n = cells.inverse.shape[0]
+    width = n + WIDTH
+    total = take(squares, 0) * 0.0
     for i in range(n):
-        misfit = whitened[i, DATA]
+        at = width * i + n
+        misfit = take(whole, at + DATA)
         for a in range(5):
-            misfit -= squares[a] * whitened[i, a]
-        chi2 += misfit * misfit
-    return chi2
+            misfit = misfit - take(squares, a) * take(whole, at + a)
+        total = total + misfit * misfit
+    put(chi2, 0, total)
+    back_substitute(whole, n, width)
+    for a in range(5):
+        if not allowed >> a & 1:
+            continue
+        apart = _estimate(a, allowed, squares, fit.terms, room.normal, room.right, room.scratch, row, found)
+        for i in range(n):  # estimator as weights on the cells
+            weight = take(row, 0) * take(whole, width * i + n)
+            for b in range(1, 5):
+                weight = weight + take(row, b) * take(whole, width * i + n + b)
+            put(weights, i, weight)
+        _growth(a, apart, cells, fit, room, tables, found)
 
 
 @njit(**KERNEL)
@@ -288,34 +393,45 @@ def fit_windows(avar, white, quantization, ramp, gap_factor, columns, to_samples
         Equivalent degrees of freedom of the cells under the fitted noise.
     """
     n_windows, n_tau = avar.shape
-    size = (n_tau + LANES - 1) // LANES * LANES
-    tables = np.zeros((size, PRODUCTS, size))
-    combine_products(pairs, ramps, tables)
+    size = (n_tau + 3) // 4 * 4
+    tables = np.zeros(size * size * PRODUCTS)
+    combine_products(pairs, ramps, size, tables)
     diagonal = np.empty((n_tau, PRODUCTS))
     for i in range(n_tau):
         for table in range(PRODUCTS):
-            diagonal[i, table] = tables[i, table, i]
+            diagonal[i, table] = tables[PRODUCTS * (i * size + i) + table]
     result = np.full((n_windows, len(FIT_FIELDS), 5), np.nan)
     misfit = np.full((n_windows, 2), np.nan)
     dof = np.full((n_windows, n_tau), np.nan)
-    system, whitened, whole = np.empty((size, LANES)), np.empty((size, LANES)), np.empty((size, size + LANES))
-    seen, root, inverse, work = np.empty((6, size)), np.empty((5, size)), np.empty(size), np.empty((2, size))
-    normal, right, squares = np.empty((5, 5)), np.empty(5), np.empty(5)
-    for w in range(n_windows):
-        n = observe(avar[w], white[w], quantization[w], ramp[w], gap_factor[w], columns, to_samples, system, seen, inverse)
-        misfit[w, 1] = 0.0
-        if n == 0:
-            continue
-        chosen = _quick(system, weight, gap_factor[w], normal, right, allowed, squares)
-        chosen = _iterate(system, seen, inverse, tables, allowed, chosen, squares, root, whole, whitened, normal, right)
-        if chosen < 0:
-            continue
-        misfit[w, 0] = _judge(
-            chosen, allowed, squares, system, seen, inverse, tables, root, whole, whitened, normal, right, work, result[w]
-        )
-        misfit[w, 1] = n
-        for a in range(5):
-            misfit[w, 1] -= (chosen & allowed) >> a & 1
-            squares[a] = result[w, 0, a] if np.isfinite(result[w, 0, a]) else 0.0
-        degrees_of_freedom(squares, avar[w], white[w], quantization[w], ramp[w], gap_factor[w], columns, to_samples, diagonal, dof[w])
+    cells, fit, room = _make_cells(size), _Fit(eights(5), eights(5), eights(5), eights(4)), _make_room(size)
+    found, row, chi2, squares, valid = eights(5 * len(FIT_FIELDS)), eights(5), eights(1), np.empty(5), np.empty(PLACES, np.int64)
+    for start in range(0, n_windows, PLACES):
+        _observe_eight(start, avar, white, quantization, ramp, gap_factor, columns, to_samples, cells, valid)
+        root_units(cells.seen, room.units)
+        _quick(cells, weight, allowed, room.normal, room.right, fit, room.scratch)
+        _refit(allowed, cells, fit, room, tables)
+        _judge(allowed, cells, fit, room, tables, found, row, chi2)
+        for w in range(start, min(start + PLACES, n_windows)):
+            place = w - start
+            misfit[w, 1] = 0.0
+            if valid[place] == 0 or fit.state[1, place] > 0.5:
+                continue
+            _write_window(allowed, valid[place], place, found, fit, chi2, result[w], misfit[w], squares)
+            degrees_of_freedom(squares, avar[w], white[w], quantization[w], ramp[w], gap_factor[w], columns, to_samples, diagonal, dof[w])
     return result, misfit, dof
+
+
+@njit(**INNER)
+def _write_window(allowed, valid, place, found, fit, chi2, result, misfit, squares):  # type: ignore[no-untyped-def]
+    """Numbers of the window in one place; its squared coefficients, zero where it has none, to `squares`."""
+    misfit[0], misfit[1] = chi2[0, place], valid
+    for a in range(5):
+        squares[a] = 0.0
+        if not allowed >> a & 1:
+            continue
+        for field in range(len(FIT_FIELDS)):
+            result[field, a] = found[5 * field + a, place]
+        if fit.terms[a, place] > 0.5:
+            misfit[1] -= 1.0
+        if np.isfinite(result[0, a]):
+            squares[a] = result[0, a]

@@ -58,6 +58,14 @@ def _see(columns, white, quantization, ramp, squares, seen):  # type: ignore[no-
     return model
 
 
+@njit(**INNER)
+def _cell_quantile(a, whole, own_dof, share, dof, most, start, step, curve):  # type: ignore[no-untyped-def]
+    """Quantile of a cell in which term `a` is alone; `whole` where nothing is missing. That of a ramp has the cell's degrees of freedom."""
+    if a == 4:
+        return _quantile(min(own_dof, most, dof), start, step, curve)
+    return whole if share == 1.0 else _quantile(min(own_dof, most), start, step, curve)
+
+
 @njit(**KERNEL)
 def cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, own_dof, ks, span, most, start, step, curve):  # type: ignore[no-untyped-def]
     """Upper limit of each squared coefficient from one cell, which cannot be less than the term's own part of it.
@@ -107,11 +115,10 @@ def cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, 
             for a in range(5):
                 if ks[i] * span[a] < ks[last]:
                     continue
-                quantile = whole[i, a]
-                if a == 4:
-                    quantile = _quantile(min(own_dof[a, i] * share, most, dof[w, i]), start, step, curve)
-                elif share != 1.0:
-                    quantile = _quantile(min(own_dof[a, i] * share, most), start, step, curve)
+                best = whole[i, a] if share <= 1.0 else 1.0  # fewer degrees of freedom have a lower quantile
+                if model >= lowest[a] * best * seen[a]:
+                    continue
+                quantile = _cell_quantile(a, whole[i, a], own_dof[a, i] * share, share, dof[w, i], most, start, step, curve)
                 reach = 1.0 / (quantile * seen[a]) if quantile > 0.0 else np.inf
                 if model * reach < lowest[a]:
                     lowest[a] = model * reach

@@ -1,7 +1,7 @@
-"""One window as a mixture of noises: what each cell sees of every term, and the covariance of the cells.
+"""Eight windows as mixtures of noises: what each cell sees of every term, and the covariance of the cells.
 
-A cell that is missing, or that pads the averaging factors to a multiple of `LANES`, is one without noise and without
-signal: zeros everywhere. So every window has the same shape.
+Everything here is an array of `gyrostab.kernels.eights`, a window in each place. A cell that is missing, or that pads the
+averaging factors, is one without noise and without signal: zeros everywhere. So every window has the same shape.
 """
 
 from __future__ import annotations
@@ -10,134 +10,188 @@ import numpy as np
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.nonnegative import REORDER
+from gyrostab.kernels.eights import number, put, root, take, where_above
 
 __all__ = [
     "DATA",
-    "LANES",
     "PRODUCTS",
+    "WIDTH",
     "combine_products",
     "covariance_rows",
     "degrees_of_freedom",
     "observe",
     "root_squares",
+    "root_units",
+    "total_variance",
     "variance_parts",
 ]
 
-#: Numbers that one vector instruction may take; inner loops run over multiples of it.
-LANES = 8
 #: Products of the four stochastic terms with each other and with a ramp, which has no scatter of its own:
 #: (a, b) for a in 0..3 and b in a..4.
 PRODUCTS = 14
 #: Column of the data behind those of the five terms in a system of equations.
 DATA = 5
+#: Columns of such a system.
+WIDTH = 6
+#: Row of `seen` that holds the unit of each term.
+_SEEN = (0, 1, 3, 4, 5)
+#: Number of the product of two terms among the tables; that of a ramp with itself, which there is not, gives any.
+_TABLE = ((0, 1, 2, 3, 4), (1, 5, 6, 7, 8), (2, 6, 9, 10, 11), (3, 7, 10, 12, 13), (4, 8, 11, 13, 13))
 
 
 @njit(**INNER)
-def combine_products(pairs, ramps, tables):  # type: ignore[no-untyped-def]
-    """Rows of the products of terms on and above the diagonal, both orders of a pair added, to `tables` (n, `PRODUCTS`, n)."""
+def combine_products(pairs, ramps, n, tables):  # type: ignore[no-untyped-def]
+    """Products of terms for cells on and above the diagonal, both orders of a pair added, to `tables`, flat (n, n, `PRODUCTS`)."""
     for i in range(pairs.shape[2]):
         for j in range(i, pairs.shape[2]):
-            table = 0
+            table = PRODUCTS * (i * n + j)
             for a in range(4):
                 for b in range(a, 5):
-                    tables[i, table, j] = ramps[a, i, j] if b == 4 else pairs[a, b, i, j] * (1.0 if a == b else 2.0)
+                    tables[table] = ramps[a, i, j] if b == 4 else pairs[a, b, i, j] * (1.0 if a == b else 2.0)
                     table += 1
 
 
 @njit(**INNER)
-def observe(avar, white, quantization, ramp, factor, columns, to_samples, system, seen, inverse):  # type: ignore[no-untyped-def]
-    """Describe the cells of a window; returns how many are valid.
+def observe(avar, white, quantization, ramp, factor, columns, to_samples, place, system, seen, inverse, facts):  # type: ignore[no-untyped-def]
+    """Describe the cells of a window in one place; returns how many are valid.
 
-    Design matrix and data go to `system`; what a unit of each squared coefficient is in sample units, as the cell sees it
-    through the gaps, to `seen`; the reciprocal of `factor` to `inverse`. What the gaps add to quantization noise comes
-    from the ends of many runs spread over each cluster, so it scatters like white noise and is counted there (row 2).
+    Design matrix and data go to `system` (row ``6 cell + column``); what a unit of each squared coefficient is in sample
+    units, as the cell sees it through the gaps, to `seen` (``6 cell + row``); the reciprocal of `factor` to `inverse`. What
+    the gaps add to quantization noise comes from the ends of many runs spread over each cluster, so it scatters like white
+    noise and is counted there (row 2). To `facts` go the columns of Q over N at the shortest valid averaging time (row 0), of
+    B over K (2) and of R over K (4) at the longest, and the most that gaps add to quantization noise (5).
     """
-    n = 0
-    system[:] = 0.0
-    seen[:] = 0.0
-    inverse[:] = 1.0
-    for i in range(avar.size):
-        if not (np.isfinite(avar[i]) and avar[i] > 0.0 and factor[i] > 0.0):
+    n, last = 0, 0
+    for fact in range(6):
+        facts[fact, place] = 0.0
+    for i in range(inverse.shape[0]):
+        here = i < avar.size and np.isfinite(avar[i]) and avar[i] > 0.0 and factor[i] > 0.0
+        inverse[i, place] = 1.0
+        for row in range(WIDTH * i, WIDTH * i + WIDTH):
+            system[row, place] = seen[row, place] = 0.0
+        if not here:
             continue
-        n += 1
+        at = WIDTH * i
         for a in range(5):
-            system[i, a] = columns[i, a]
-        system[i, 0] *= quantization[i]
-        system[i, 1] *= white[i]
-        system[i, 4] *= ramp[i]
-        system[i, DATA] = avar[i]
-        seen[0, i] = min(quantization[i], 1.0) * to_samples[0]
-        seen[1, i] = white[i] * to_samples[1]
-        seen[2, i] = max(quantization[i] - 1.0, 0.0) * columns[i, 0] / columns[i, 1] * to_samples[1]
-        seen[3, i] = to_samples[2]
-        seen[4, i] = to_samples[3]
-        seen[5, i] = ramp[i] * to_samples[4]
-        inverse[i] = 1.0 / factor[i]
+            system[at + a, place] = columns[i, a]
+        system[at, place] *= quantization[i]
+        system[at + 1, place] *= white[i]
+        system[at + 4, place] *= ramp[i]
+        system[at + DATA, place] = avar[i]
+        seen[at, place] = min(quantization[i], 1.0) * to_samples[0]
+        seen[at + 1, place] = white[i] * to_samples[1]
+        seen[at + 2, place] = max(quantization[i] - 1.0, 0.0) * columns[i, 0] / columns[i, 1] * to_samples[1]
+        seen[at + 3, place] = to_samples[2]
+        seen[at + 4, place] = to_samples[3]
+        seen[at + 5, place] = ramp[i] * to_samples[4]
+        inverse[i, place] = 1.0 / factor[i]
+        facts[5, place] = max(facts[5, place], seen[at + 2, place])
+        if n == 0:
+            facts[0, place] = system[at, place] / system[at + 1, place]
+        n, last = n + 1, at
+    if n > 0:
+        facts[2, place] = system[last + 2, place] / system[last + 3, place]
+        facts[4, place] = system[last + 4, place] / system[last + 3, place]
     return n
 
 
 @njit(**INNER)
-def root_squares(squares, seen, root):  # type: ignore[no-untyped-def]
-    """Square roots of the squared coefficients in sample units, term by term and cell by cell."""
-    for i in range(root.shape[1]):
-        root[0, i] = np.sqrt(squares[0] * seen[0, i])
-        root[1, i] = np.sqrt(squares[1] * seen[1, i] + squares[0] * seen[2, i])
-        root[2, i] = np.sqrt(squares[2] * seen[3, i])
-        root[3, i] = np.sqrt(squares[3] * seen[4, i])
-        root[4, i] = np.sqrt(squares[4] * seen[5, i])
+def root_units(seen, units):  # type: ignore[no-untyped-def]
+    """Square roots of what a unit of each squared coefficient is in sample units, cell by cell: row ``5 cell + term``."""
+    for i in range(seen.shape[0] // 6):
+        for a in range(5):
+            put(units, 5 * i + a, root(take(seen, 6 * i + _SEEN[a])))
 
 
-@njit(fastmath=REORDER, **INNER)
-def covariance_rows(root, inverse, tables, out):  # type: ignore[no-untyped-def]
-    """Covariance of the cells, on and above the diagonal of `out`."""
-    n = root.shape[1]
-    r0, r1, r2, r3, r4 = root[0], root[1], root[2], root[3], root[4]
+@njit(**INNER)
+def root_squares(squares, seen, units, roots):  # type: ignore[no-untyped-def]
+    """Square roots of the squared coefficients in sample units, cell by cell: row ``5 cell + term``."""
+    s0, s1 = take(squares, 0), take(squares, 1)
+    r0, r2, r3, r4 = root(s0), root(take(squares, 2)), root(take(squares, 3)), root(take(squares, 4))
+    for i in range(seen.shape[0] // 6):
+        put(roots, 5 * i, r0 * take(units, 5 * i))
+        put(roots, 5 * i + 1, root(s1 * take(seen, 6 * i + 1) + s0 * take(seen, 6 * i + 2)))
+        put(roots, 5 * i + 2, r2 * take(units, 5 * i + 2))
+        put(roots, 5 * i + 3, r3 * take(units, 5 * i + 3))
+        put(roots, 5 * i + 4, r4 * take(units, 5 * i + 4))
+
+
+@njit(**INNER)
+def _sum_products(tables, at, a0, a1, a2, a3, a4):  # type: ignore[no-untyped-def]
+    """Covariance of two cells without their share of degrees of freedom; the a are products of the roots of both."""
+    first = a0 * number(tables, at) + a1 * number(tables, at + 1) + a2 * number(tables, at + 2) + a3 * number(tables, at + 3)
+    second = a1 * number(tables, at + 5) + a2 * number(tables, at + 6) + a3 * number(tables, at + 7) + a4 * number(tables, at + 8)
+    third = a2 * number(tables, at + 9) + a3 * number(tables, at + 10) + a4 * number(tables, at + 11)
+    fourth = a3 * number(tables, at + 12) + a4 * number(tables, at + 13)
+    return a0 * (first + a4 * number(tables, at + 4)) + a1 * second + a2 * third + a3 * fourth
+
+
+@njit(**INNER)
+def covariance_rows(roots, inverse, tables, out, width):  # type: ignore[no-untyped-def]
+    """Covariance of the cells, on and above the diagonal of `out`, row ``width i + j``."""
+    n = inverse.shape[0]
     for i in range(n):
-        row, line, share = out[i], tables[i], inverse[i]
-        p00, p01, p02, p03, p04, p11, p12 = line[0], line[1], line[2], line[3], line[4], line[5], line[6]
-        p13, p14, p22, p23, p24, p33, p34 = line[7], line[8], line[9], line[10], line[11], line[12], line[13]
-        s0, s1, s2, s3, s4 = r0[i], r1[i], r2[i], r3[i], r4[i]
-        for j in range(np.uint64(i & -LANES), np.uint64(n)):
-            a0, a1, a2, a3, a4 = s0 * r0[j], s1 * r1[j], s2 * r2[j], s3 * r3[j], s4 * r4[j]
-            total = a0 * (a0 * p00[j] + a1 * p01[j] + a2 * p02[j] + a3 * p03[j] + a4 * p04[j])
-            total += a1 * (a1 * p11[j] + a2 * p12[j] + a3 * p13[j] + a4 * p14[j])
-            total += a2 * (a2 * p22[j] + a3 * p23[j] + a4 * p24[j]) + a3 * (a3 * p33[j] + a4 * p34[j])
-            row[j] = total * min(share, inverse[j])  # the poorer cell uses a part of what the richer one uses
+        s0, s1, s2 = take(roots, 5 * i), take(roots, 5 * i + 1), take(roots, 5 * i + 2)
+        s3, s4, share = take(roots, 5 * i + 3), take(roots, 5 * i + 4), take(inverse, i)
+        for j in range(i, n):
+            a0, a1, a2 = s0 * take(roots, 5 * j), s1 * take(roots, 5 * j + 1), s2 * take(roots, 5 * j + 2)
+            a3, a4, other = s3 * take(roots, 5 * j + 3), s4 * take(roots, 5 * j + 4), take(inverse, j)
+            total = _sum_products(tables, PRODUCTS * (i * n + j), a0, a1, a2, a3, a4)
+            put(out, width * i + j, total * where_above(share, other, other, share))  # the poorer cell uses a part of what the richer uses
 
 
-@njit(fastmath=REORDER, **INNER)
-def variance_parts(root, term, inverse, tables, weights, part, out):  # type: ignore[no-untyped-def]
-    """Variance of the cells added with `weights`, their covariance as in `covariance_rows`; `part` is scratch.
+@njit(**INNER)
+def total_variance(roots, inverse, tables, weights):  # type: ignore[no-untyped-def]
+    """Variance of the cells added with `weights`, their covariance as in `covariance_rows`."""
+    n = inverse.shape[0]
+    total = take(weights, 0) * 0.0
+    for i in range(n):
+        s0, s1, s2 = take(roots, 5 * i), take(roots, 5 * i + 1), take(roots, 5 * i + 2)
+        s3, s4, share = take(roots, 5 * i + 3), take(roots, 5 * i + 4), take(inverse, i)
+        line = total * 0.0
+        for j in range(i, n):
+            a0, a1, a2 = s0 * take(roots, 5 * j), s1 * take(roots, 5 * j + 1), s2 * take(roots, 5 * j + 2)
+            a3, a4, other = s3 * take(roots, 5 * j + 3), s4 * take(roots, 5 * j + 4), take(inverse, j)
+            weight = take(weights, j) * where_above(share, other, other, share) * (1.0 if i == j else 2.0)
+            line = line + _sum_products(tables, PRODUCTS * (i * n + j), a0, a1, a2, a3, a4) * weight
+        total = total + line * take(weights, i)
+    return total
 
-    `out` (3,) gets the products in which `term` has no part, one factor and both factors.
+
+@njit(**INNER)
+def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: ignore[no-untyped-def]
+    """Variance of the cells added with `weights`, as a polynomial in the squared coefficient of `term`.
+
+    `roots` are those of the noise without the term, `units` those of `root_units`. To the rows of `out` go the variance
+    without the term, its growth per unit, and per unit squared.
     """
-    n = root.shape[1]
-    out[:] = 0.0
-    table = -1
-    for a in range(4):
-        for b in range(a, 5):
-            table += 1
-            left, right = root[a], root[b]
-            biggest = 0.0
-            for j in range(n):
-                part[j] = left[j] * right[j] * weights[j]
-                biggest = max(biggest, abs(part[j]))
-            if biggest == 0.0:
-                continue
-            total = 0.0
-            for i in range(n):
-                line, share = tables[i, table], inverse[i]
-                dot = -0.5 * line[i] * part[i] * share
-                for j in range(np.uint64(i & -LANES), np.uint64(n)):
-                    dot += line[j] * part[j] * min(share, inverse[j])
-                total += 2.0 * dot * part[i]
-            out[(a == term) + (b == term)] += total
+    n = inverse.shape[0]
+    t0, t1, t2, t3, t4, itself = _TABLE[term][0], _TABLE[term][1], _TABLE[term][2], _TABLE[term][3], _TABLE[term][4], _TABLE[term][term]
+    scatters = 0.0 if term == 4 else 1.0
+    null = take(weights, 0) * 0.0
+    linear, square = null, null
+    for i in range(n):
+        s0, s1, s2 = take(roots, 5 * i), take(roots, 5 * i + 1), take(roots, 5 * i + 2)
+        s3, s4, share = take(roots, 5 * i + 3), take(roots, 5 * i + 4), take(inverse, i)
+        unit, factor = take(units, 5 * i + term), take(weights, i)
+        for j in range(i, n):
+            at = PRODUCTS * (i * n + j)
+            a0, a1, a2 = s0 * take(roots, 5 * j), s1 * take(roots, 5 * j + 1), s2 * take(roots, 5 * j + 2)
+            a3, a4, other = s3 * take(roots, 5 * j + 3), s4 * take(roots, 5 * j + 4), take(inverse, j)
+            weight = factor * take(weights, j) * where_above(share, other, other, share) * (1.0 if i == j else 2.0)
+            null = null + _sum_products(tables, at, a0, a1, a2, a3, a4) * weight
+            step = unit * take(units, 5 * j + term)
+            line = a0 * number(tables, at + t0) + a1 * number(tables, at + t1) + a2 * number(tables, at + t2)
+            linear = linear + (line + a3 * number(tables, at + t3) + a4 * number(tables, at + t4)) * step * weight
+            square = square + step * step * number(tables, at + itself) * weight
+    put(out, 0, null)
+    put(out, 1, linear)
+    put(out, 2, square * scatters)
 
 
 @njit(**INNER)
 def degrees_of_freedom(squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
-    """Equivalent degrees of freedom of each finite cell under a mixture of noises, ``2 mean^2 / variance``."""
+    """Equivalent degrees of freedom of each finite cell of a window under a mixture of noises, ``2 mean^2 / variance``."""
     amounts = np.empty(5)
     for i in range(avar.size):
         if not np.isfinite(avar[i]):

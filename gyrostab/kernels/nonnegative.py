@@ -1,4 +1,4 @@
-"""Small dense linear algebra: elimination, and least squares with coefficients that cannot be negative.
+"""Least squares with coefficients that cannot be negative.
 
 The non-negative solution is exact: of five terms there are at most 31 subsets, and all are tried.
 """
@@ -10,56 +10,10 @@ from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["back_substitute", "eliminate", "solve_nonnegative", "solve_subset"]
+__all__ = ["REORDER", "solve_nonnegative"]
 
 #: Lets the compiler add in another order, which it needs for vector code; the order is the same on every call.
 REORDER = {"reassoc", "contract", "nsz"}
-
-
-@njit(fastmath=REORDER, **INNER)
-def eliminate(system):  # type: ignore[no-untyped-def]
-    """Replace ``[C | Y]`` by ``[U | U^-T Y]`` where ``C = U^T U``; False when C is not positive definite.
-
-    Parameters
-    ----------
-    system : float64 (n, width)
-        The upper triangle of C, n a multiple of 4, and right-hand sides beside it. Four rows at a time are taken out of
-        those below, so that each of these is read and written once for the four.
-    """
-    n, width = system.shape
-    end = np.uint64(width)  # an unsigned index needs no test for a negative one, which would keep loops from vector code
-    for k in range(0, n, 4):
-        start = np.uint64(k)
-        for p in range(k, k + 4):
-            if not system[p, p] > 0.0:
-                return False
-            inverse = 1.0 / np.sqrt(system[p, p])
-            for j in range(start, end):
-                system[p, j] *= inverse
-            for i in range(p + 1, k + 4):
-                share = system[p, i]
-                for j in range(start, end):
-                    system[i, j] -= share * system[p, j]
-        first, second, third, fourth = system[k], system[k + 1], system[k + 2], system[k + 3]
-        for i in range(k + 4, n):
-            a, b, c, d = first[i], second[i], third[i], fourth[i]
-            row = system[i]
-            for j in range(np.uint64(i & -4), end):
-                row[j] -= a * first[j] + b * second[j] + c * third[j] + d * fourth[j]
-    return True
-
-
-@njit(fastmath=REORDER, **INNER)
-def back_substitute(system, vector):  # type: ignore[no-untyped-def]
-    """Solve ``U x = vector`` in place, U the upper triangle that `eliminate` left."""
-    n = vector.size
-    for back in range(n):
-        i = n - 1 - back
-        row = system[i]
-        total = 0.0
-        for j in range(np.uint64(i + 1), np.uint64(n)):
-            total += row[j] * vector[j]
-        vector[i] = (vector[i] - total) / row[i]
 
 
 @njit(**INNER)
@@ -73,7 +27,7 @@ def _list_members(subset, members):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def solve_subset(normal, right, subset, solution, work, members):  # type: ignore[no-untyped-def]
+def _solve_subset(normal, right, subset, solution, work, members):  # type: ignore[no-untyped-def]
     """Solve the normal equations for the terms in the bit set `subset`; False when they cannot be told apart.
 
     Parameters
@@ -151,7 +105,7 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
         scaled_right[i] = right[i] * scale[i]
         for j in range(n):
             scaled[i, j] = normal[i, j] * scale[i] * scale[j]
-    if guess and solve_subset(scaled, scaled_right, guess, trial, work, members) and _optimal(scaled, scaled_right, allowed, guess, trial):
+    if guess and _solve_subset(scaled, scaled_right, guess, trial, work, members) and _optimal(scaled, scaled_right, allowed, guess, trial):
         for i in range(n):
             solution[i] = trial[i] * scale[i]
         return guess
@@ -159,7 +113,7 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
     chosen = 0
     solution[:] = 0.0
     for subset in range(1, 1 << n):
-        if subset & ~allowed or not solve_subset(scaled, scaled_right, subset, trial, work, members):
+        if subset & ~allowed or not _solve_subset(scaled, scaled_right, subset, trial, work, members):
             continue
         gain = 0.0
         feasible = True

@@ -5,9 +5,34 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gyrostab.kernels.compiled import KERNEL
+from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.nonnegative import REORDER
 
 __all__ = ["window_trend"]
+
+
+@njit(fastmath=REORDER, **INNER)
+def _sums(values, seconds, origin, start):  # type: ignore[no-untyped-def]
+    """Number of finite values, and the sums of them and of their times beyond an origin."""
+    count, total, elapsed = 0.0, 0.0, 0.0
+    for i in range(values.size):
+        finite = np.isfinite(values[i])
+        count += 1.0 if finite else 0.0
+        total += values[i] - origin if finite else 0.0
+        elapsed += seconds[i] - start if finite else 0.0
+    return count, total, elapsed
+
+
+@njit(fastmath=REORDER, **INNER)
+def _products(values, seconds, mean, centre):  # type: ignore[no-untyped-def]
+    """Sums over finite values of their deviation from the mean times that of their times, and of the square of the latter."""
+    covariance, variance = 0.0, 0.0
+    for i in range(values.size):
+        finite = np.isfinite(values[i])
+        step = seconds[i] - centre if finite else 0.0
+        covariance += step * (values[i] - mean) if finite else 0.0
+        variance += step * step
+    return covariance, variance
 
 
 @njit(**KERNEL)
@@ -30,23 +55,16 @@ def window_trend(values, seconds, first, last):  # type: ignore[no-untyped-def]
     """
     out = np.full((2, first.size), np.nan)
     for j in range(first.size):
-        count = 0
-        mean = 0.0
-        centre = 0.0
-        for i in range(first[j], last[j]):
-            if np.isfinite(values[i]):
-                count += 1
-                mean += (values[i] - mean) / count
-                centre += (seconds[i] - centre) / count
-        if count == 0:
+        begin, end = first[j], last[j]
+        while begin < end and not np.isfinite(values[begin]):
+            begin += 1
+        if begin >= end:
             continue
-        out[0, j] = mean
-        covariance = 0.0
-        variance = 0.0
-        for i in range(first[j], last[j]):
-            if np.isfinite(values[i]):
-                covariance += (seconds[i] - centre) * (values[i] - mean)
-                variance += (seconds[i] - centre) ** 2
+        origin, start = values[begin], seconds[begin]  # near the mean, so that the sums lose no digits
+        here, there = values[begin:end], seconds[begin:end]
+        count, total, elapsed = _sums(here, there, origin, start)
+        out[0, j] = mean = origin + total / count
+        covariance, variance = _products(here, there, mean, start + elapsed / count)
         if variance > 0.0:
             out[1, j] = covariance / variance
     return out

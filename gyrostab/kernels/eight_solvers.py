@@ -1,0 +1,211 @@
+"""Dense linear algebra of eight small problems side by side: elimination, and least squares that cannot be negative.
+
+Matrices and vectors are arrays of `gyrostab.kernels.eights`; element (i, j) of a matrix of w columns is row ``w i + j``.
+A set of terms is one row per term: above one half in the places whose problem has the term. What `gyrostab.kernels.nonnegative`
+does for one problem is done here for eight that differ in their sets.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from gyrostab.kernels.compiled import INNER
+from gyrostab.kernels.eights import PLACES, put, root, take, where_above
+
+__all__ = ["back_substitute", "eliminate", "scale_equations", "solve_nonnegative_eights", "solve_terms"]
+
+#: Terms at most, of which a problem has a set.
+_TERMS = 5
+
+
+@njit(**INNER)
+def _finish_pivot(system, width, p, end, ok):  # type: ignore[no-untyped-def]
+    """Scale row p of a group of four that ends before `end`, and take it out of those below in the group."""
+    pivot = take(system, width * p + p)
+    put(ok, 0, where_above(pivot, 0.0, take(ok, 0), 0.0))
+    inverse = 1.0 / root(where_above(pivot, 0.0, pivot, 1.0))
+    for j in range(width * p + p, width * p + width):
+        put(system, j, take(system, j) * inverse)
+    for i in range(p + 1, end):
+        share = take(system, width * p + i)
+        for j in range(i, width):
+            put(system, width * i + j, take(system, width * i + j) - share * take(system, width * p + j))
+
+
+@njit(**INNER)
+def eliminate(system, n, width, ok):  # type: ignore[no-untyped-def]
+    """Replace ``[C | Y]`` by ``[U | U^-T Y]`` where ``C = U^T U``.
+
+    Parameters
+    ----------
+    system : eights (n * width,)
+        The upper triangle of C, n a multiple of 4, and right-hand sides beside it. Four rows at a time are taken out of
+        four of those below, so that each of these is read and written once for the four.
+    ok : eights (1,)
+        One where C was positive definite, zero where the result means nothing.
+    """
+    put(ok, 0, 1.0)
+    for k in range(0, n, 4):
+        for p in range(k, k + 4):
+            _finish_pivot(system, width, p, k + 4, ok)
+        first, second, third, fourth = width * k, width * k + width, width * (k + 2), width * (k + 3)
+        for i in range(k + 4, n, 2):
+            a, b, c, d = take(system, first + i), take(system, second + i), take(system, third + i), take(system, fourth + i)
+            after, above, below = i + 1, width * i, width * i + width
+            e, f, g, h = (
+                take(system, first + after),
+                take(system, second + after),
+                take(system, third + after),
+                take(system, fourth + after),
+            )
+            for j in range(i, width):
+                s, t, u, v = take(system, first + j), take(system, second + j), take(system, third + j), take(system, fourth + j)
+                put(system, above + j, take(system, above + j) - a * s - b * t - c * u - d * v)
+                put(system, below + j, take(system, below + j) - e * s - f * t - g * u - h * v)
+
+
+@njit(**INNER)
+def back_substitute(system, n, width):  # type: ignore[no-untyped-def]
+    """Replace the first five right-hand sides Y beside an upper triangle U, as `eliminate` left them, by ``U^-1 Y``."""
+    for i in range(n - 1, -1, -1):
+        at = width * i
+        own = at + n
+        a, b, c, d, e = take(system, own), take(system, own + 1), take(system, own + 2), take(system, own + 3), take(system, own + 4)
+        for j in range(i + 1, n):
+            share, right = take(system, at + j), width * j + n
+            a = a - share * take(system, right)
+            b = b - share * take(system, right + 1)
+            c = c - share * take(system, right + 2)
+            d = d - share * take(system, right + 3)
+            e = e - share * take(system, right + 4)
+        inverse = 1.0 / take(system, at + i)
+        put(system, own, a * inverse)
+        put(system, own + 1, b * inverse)
+        put(system, own + 2, c * inverse)
+        put(system, own + 3, d * inverse)
+        put(system, own + 4, e * inverse)
+
+
+@njit(**INNER)
+def scale_equations(normal, scale, scaled):  # type: ignore[no-untyped-def]
+    """Normal matrix with ones on its diagonal to `scaled`, and what it was multiplied with on each side to `scale`."""
+    for i in range(_TERMS):
+        diagonal = take(normal, 6 * i)
+        put(scale, i, where_above(diagonal, 0.0, 1.0 / root(diagonal), 0.0))
+    for i in range(_TERMS):
+        for j in range(_TERMS):
+            put(scaled, 5 * i + j, take(normal, 5 * i + j) * take(scale, i) * take(scale, j))
+
+
+@njit(**INNER)
+def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untyped-def]
+    """Solve the normal equations for a set of terms in each place; one where its terms can be told apart, else zero.
+
+    Parameters
+    ----------
+    scaled : eights (25,); right : eights (5,)
+        Normal equations.
+    terms : eights (5,)
+        Sets of terms, ones and zeros.
+    solution : eights (5,)
+        Overwritten, with zero for the terms outside the set.
+    work : eights (25,)
+        Scratch.
+    """
+    ok = take(terms, 0) * 0.0 + 1.0
+    for i in range(_TERMS):  # Cholesky factor, its diagonal inverted, and forward solution, row by row
+        here = take(terms, i)
+        pivot = take(scaled, 6 * i) * (1.0 + 1e-12) * here + (1.0 - here)  # a term outside the set stands alone
+        total = take(right, i) * here
+        for j in range(i):
+            share = take(scaled, 5 * i + j) * here * take(terms, j)
+            for p in range(j):
+                share = share - take(work, 5 * i + p) * take(work, 5 * j + p)
+            share = share * take(work, 6 * j)
+            put(work, 5 * i + j, share)
+            pivot = pivot - share * share
+            total = total - share * take(solution, j)
+        ok = where_above(pivot, 0.0, ok, 0.0)
+        inverse = 1.0 / root(where_above(pivot, 0.0, pivot, 1.0))
+        put(work, 6 * i, inverse)
+        put(solution, i, total * inverse)
+    for i in range(_TERMS - 1, -1, -1):
+        total = take(solution, i)
+        for p in range(i + 1, _TERMS):
+            total = total - take(work, 5 * p + i) * take(solution, p)
+        put(solution, i, total * take(work, 6 * i))
+    return ok
+
+
+@njit(**INNER)
+def _optimal(scaled, right, allowed, terms, solution, ok):  # type: ignore[no-untyped-def]
+    """`ok` where the solution for `terms` is above zero and no other allowed term would improve it (Karush-Kuhn-Tucker), else zero."""
+    some = ok * 0.0
+    for i in range(_TERMS):
+        here, slope = take(terms, i), take(right, i)
+        for j in range(_TERMS):
+            slope = slope - take(scaled, 5 * i + j) * take(solution, j)
+        inside = where_above(take(solution, i), 0.0, ok, 0.0)
+        outside = where_above(slope, 0.0, 0.0, ok) if allowed >> i & 1 else ok
+        ok = where_above(here, 0.5, inside, outside)
+        some = some + here
+    return where_above(some, 0.5, ok, 0.0)
+
+
+@njit(**INNER)
+def _try_all(scaled, right, allowed, done, terms, solution, trial, tried, work):  # type: ignore[no-untyped-def]
+    """Terms and solution of the best of all subsets, in the places where `done` is zero."""
+    best = done * 0.0
+    for i in range(_TERMS):
+        put(terms, i, where_above(done, 0.5, take(terms, i), 0.0))
+        put(solution, i, where_above(done, 0.5, take(solution, i), 0.0))
+    for subset in range(1, 1 << _TERMS):
+        if subset & ~allowed:
+            continue
+        for i in range(_TERMS):
+            put(tried, i, 1.0 if subset >> i & 1 else 0.0)
+        feasible = solve_terms(scaled, right, tried, trial, work)
+        gain = best * 0.0
+        for i in range(_TERMS):
+            feasible = where_above(0.0, take(trial, i), 0.0, feasible)
+            gain = gain + take(trial, i) * take(right, i)
+        gain = where_above(feasible, 0.5, where_above(done, 0.5, 0.0, gain), 0.0)
+        for i in range(_TERMS):
+            put(terms, i, where_above(gain, best, take(tried, i), take(terms, i)))
+            put(solution, i, where_above(gain, best, take(trial, i), take(solution, i)))
+        best = where_above(gain, best, gain, best)
+
+
+@njit(**INNER)
+def solve_nonnegative_eights(normal, right, allowed, terms, squares, room):  # type: ignore[no-untyped-def]
+    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0`` in each place.
+
+    Parameters
+    ----------
+    normal : eights (25,); right : eights (5,)
+        Normal equations.
+    allowed : int
+        Bit set of the terms that may be used, in every place.
+    terms : eights (5,)
+        Sets of terms that are tried first; where one holds the minimiser, no other is tried. Overwritten with the terms
+        above zero.
+    squares : eights (5,)
+        Overwritten with the minimiser.
+    room : eights (75,)
+        Scratch.
+    """
+    scaled, work, scale, scaled_right = room[:25], room[25:50], room[50:55], room[55:60]
+    solution, trial, tried = room[60:65], room[65:70], room[70:75]
+    scale_equations(normal, scale, scaled)
+    for i in range(_TERMS):
+        put(scaled_right, i, take(right, i) * take(scale, i))
+    found = solve_terms(scaled, scaled_right, terms, solution, work)
+    done = _optimal(scaled, scaled_right, allowed, terms, solution, found)
+    put(tried, 0, done)
+    everywhere = True
+    for place in range(PLACES):
+        everywhere = everywhere and tried[0, place] > 0.5
+    if not everywhere:
+        _try_all(scaled, scaled_right, allowed, done, terms, solution, trial, tried, work)
+    for i in range(_TERMS):
+        put(squares, i, take(solution, i) * take(scale, i))

@@ -1,0 +1,157 @@
+"""Eight float64 as one number, for kernels that do the same small problem many times: eight problems side by side.
+
+A matrix of forty rows is too small for vector code along its rows: most vectors are part filled, and every sum waits for the one before.
+With a problem in each of the eight places all vectors are full, nothing is added across places, and so a problem has the same result,
+bit for bit, whatever its neighbours are. Where the processor has shorter vectors, the compiler splits these.
+
+Arrays of eights are float64 (n, 8), `eights` makes them; ``a[k, place]`` is one number of them, as always.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.core.imputils import lower_builtin, lower_cast
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, register_model
+
+from gyrostab.kernels.compiled import INNER
+
+__all__ = ["PLACES", "eights", "number", "put", "root", "take", "where_above"]
+
+#: Problems side by side.
+PLACES = 8
+
+_VECTOR = ir.VectorType(ir.DoubleType(), PLACES)
+_SHORT = ir.IntType(32)
+#: A product that is added may be rounded once instead of twice, as in the code of the compiler's own making.
+_FUSE = ("contract",)
+
+
+class _EightType(types.Type):  # type: ignore[misc]
+    def __init__(self) -> None:
+        super().__init__(name="Eight")
+
+
+_EIGHT = _EightType()
+
+
+@register_model(_EightType)
+class _EightModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _VECTOR)
+
+
+@lower_cast(types.Float, _EightType)
+def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
+    """A plain number beside eights stands for eight of it."""
+    wide = context.cast(builder, value, source, types.float64)
+    first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), wide, ir.Constant(_SHORT, 0))
+    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_SHORT, PLACES), [0] * PLACES))
+
+
+def _operator(symbol: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
+    """Teach the compiler one operator between eights, or between eights and a plain number."""
+
+    class Typing(AbstractTemplate):  # type: ignore[misc]
+        def generic(self, args: Any, kws: Any) -> Any:
+            known = [isinstance(one, _EightType) for one in args]
+            if any(known) and all(eight or isinstance(one, types.Float) for eight, one in zip(known, args, strict=True)):
+                return signature(_EIGHT, _EIGHT, _EIGHT)
+            return None
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return emit(builder, *args)
+
+    infer_global(symbol)(Typing)
+    lower_builtin(symbol, _EightType, _EightType)(lower)
+
+
+_operator(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=_FUSE))
+_operator(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=_FUSE))
+_operator(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=_FUSE))
+_operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
+
+
+def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    """Where the eights number `index` of a C-contiguous (n, 8) array stand."""
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [index])
+
+
+def _is_array_of_eights(array: Any) -> bool:
+    return isinstance(array, types.Array) and array.ndim == 2 and array.layout == "C" and array.dtype == types.float64
+
+
+@intrinsic
+def take(typing_context: Any, array: Any, index: Any) -> Any:
+    """Eights number `index` of an array of `eights`."""
+    if not (_is_array_of_eights(array) and isinstance(index, types.Integer)):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.load(_address(context, builder, sig.args[0], *args), align=8)
+
+    return _EIGHT(array, types.intp), emit
+
+
+@intrinsic
+def put(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
+    """Write eights, or eight times a plain number, to place `index` of an array of `eights`."""
+    if not (_is_array_of_eights(array) and isinstance(index, types.Integer)):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        builder.store(args[2], _address(context, builder, sig.args[0], *args[:2]), align=8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, _EIGHT), emit
+
+
+@intrinsic
+def number(typing_context: Any, array: Any, index: Any) -> Any:
+    """Element `index`, not negative, of a flat array: a plain number for all eight. Indexing would test for a negative index."""
+    if not (isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C" and isinstance(index, types.Integer)):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        return builder.load(builder.gep(data, [args[1]]))
+
+    return types.float64(array, types.intp), emit
+
+
+@intrinsic
+def root(typing_context: Any, value: Any) -> Any:
+    """Square roots."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{PLACES}f64"), args)
+
+    return _EIGHT(_EIGHT), emit
+
+
+@intrinsic
+def where_above(typing_context: Any, x: Any, y: Any, yes: Any, no: Any) -> Any:
+    """`yes` where ``x > y``, `no` elsewhere and where x or y is NaN."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
+
+    return _EIGHT(_EIGHT, _EIGHT, _EIGHT, _EIGHT), emit
+
+
+@njit(**INNER)
+def eights(n):  # type: ignore[no-untyped-def]
+    """Zeros (n, 8), each eight of them in one line of the cache."""
+    room = np.zeros((n + 1) * PLACES)
+    skip = -(room.ctypes.data // 8) % PLACES
+    return room[skip : skip + n * PLACES].reshape((n, PLACES))
