@@ -39,11 +39,11 @@ def fletcher32(data: NDArray[np.uint8]) -> int:
     total, sums, some = _sums(data[: 2 * even].view("<u2"))
     if data.size % 2:
         last = int(data[-1])
-        total, sums, some = total + last, sums + total + last, some or last > 0
+        total, sums, some = total + last, sums + total + last, some | last
     return _half(sums, some) << 16 | _half(total, some)
 
 
-def _half(amount: int, some: bool) -> int:
+def _half(amount: int, some: int) -> int:
     """A sum of words whose bytes are swapped; of anything but zeros it is never 0 but 65535, for it is folded, not divided."""
     return int(amount) * 256 % 65535 or (65535 if some else 0)
 
@@ -51,7 +51,7 @@ def _half(amount: int, some: bool) -> int:
 @njit(**KERNEL)
 def _sums(words):  # type: ignore[no-untyped-def]
     """Sum of the words and sum of the sums after each, modulo 65535 (where swapping the bytes is times 256); whether any is not 0."""
-    total, sums, some = np.int64(0), np.int64(0), np.bool_(False)
+    total, sums, some = np.int64(0), np.int64(0), np.int64(0)
     for begin in range(0, words.size, 256):
         block = words[begin : begin + 256]
         plain, weighted = np.int64(0), np.int64(0)
@@ -60,5 +60,5 @@ def _sums(words):  # type: ignore[no-untyped-def]
             weighted += (block.size - i) * np.int64(block[i])
         sums = (sums + block.size * total + weighted) % 65535
         total = (total + plain) % 65535
-        some |= plain > 0
+        some |= plain
     return total, sums, some
