@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pty
 import re
@@ -186,6 +187,21 @@ def test_an_interrupt_while_the_program_loads_is_exit_code_3(monkeypatch, capsys
     monkeypatch.setattr("gyrostab.cli.main", interrupted)
     assert start() == 3
     assert "interrupted" in capsys.readouterr().err
+
+
+def test_cycles_are_looked_for_seldom_and_afterwards_as_before(monkeypatch):
+    before, found = gc.get_threshold(), []
+
+    class Failing(list):
+        def __call__(self, *arguments, **options) -> None:
+            found.append(gc.get_threshold())
+            raise RuntimeError("no")
+
+    monkeypatch.setattr("gyrostab.cli.app", Failing())
+    assert call("scan", "log.csv") == 1
+    assert found[0][0] >= 10 * before[0]
+    assert found[0][1:] == before[1:]
+    assert gc.get_threshold() == before
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
