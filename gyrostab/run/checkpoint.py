@@ -80,10 +80,10 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     """
     arrays = {str(name): np.ascontiguousarray(variable.values) for name, variable in dataset.variables.items()}
     described, place = {}, 0
-    for name, values in arrays.items():
-        attrs = _to_json(dataset[name].attrs)
+    for (name, values), variable in zip(arrays.items(), dataset.variables.values(), strict=True):
         described[name] = {
-            "dims": list(dataset[name].dims), "dtype": values.dtype.str, "shape": list(values.shape), "place": place, "attrs": attrs,
+            "dims": list(variable.dims), "dtype": values.dtype.str, "shape": list(values.shape), "place": place,
+            "attrs": _to_json(variable.attrs),
         }  # fmt: skip
         place += -(-values.nbytes // _ALIGN) * _ALIGN
     header = {
