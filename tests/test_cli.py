@@ -211,12 +211,12 @@ def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
         "import os, signal, sys, xarray\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background starts with it ignored\n"
         "from gyrostab.cli import main\n"
-        "write = xarray.Dataset.to_netcdf\n"
+        "write = xarray.Dataset.dump_to_store\n"
         "def slow(dataset, target, **options):\n"
         "    written = write(dataset, target, **options)\n"
         f"    os.kill(os.getpid(), signal.{name})\n"
         "    return written\n"
-        "xarray.Dataset.to_netcdf = slow\n"
+        "xarray.Dataset.dump_to_store = slow\n"
         f"sys.exit(main(['ingest', {str(path)!r}, '-o', {str(tmp_path / 'log.nc')!r}]))"
     )
     stopped(code, exit_code=3, says="interrupted")
