@@ -18,6 +18,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +37,7 @@ from gyrostab import davar, make_log
 from gyrostab.davar.plan import last_sample, units_of_work
 from gyrostab.kernels.integrate import present_runs
 from gyrostab.kernels.surface import Unit, surface_unit
+from gyrostab.kernels.workspace import Workspace
 from gyrostab.windows import averaging_factors, thin
 
 RATE = 100.0
@@ -160,7 +162,7 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
         "recursion as printed, numba": (lambda: davar(log, method="recursive", **options), repeats),
     }
     fast: dict[str, Callable[[], object]] = {
-        "block sums, kernel": lambda: [surface_unit(part, unit) for part in parts],
+        "block sums, kernel": lambda: run_kernel(parts, unit, workers=1),
         "block sums, `davar`": lambda: davar(log, **options),
         "bare loop, as many terms": bare(number_of_terms(parts, unit)),
     }
@@ -216,8 +218,9 @@ def archive(repeats: int, quick: bool) -> Iterator[str]:
 
 
 def run_kernel(parts: list[np.ndarray], unit: Unit, workers: int) -> None:
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(lambda part: surface_unit(part, unit), parts))
+    own = threading.local()
+    with ThreadPoolExecutor(workers, initializer=lambda: setattr(own, "space", Workspace())) as pool:
+        list(pool.map(lambda part: surface_unit(part, unit, own.space), parts))
 
 
 def run_davar(log: xr.Dataset, options: dict[str, str], workers: int) -> None:

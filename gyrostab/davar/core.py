@@ -22,6 +22,7 @@ from gyrostab.kernels.least_squares import identify_noise
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_theta
 from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
+from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, avar_columns, sample_squares
 from gyrostab.schema import attributes
 from gyrostab.store.direct import can_fill, fill_row, stretch
@@ -207,9 +208,9 @@ def davar_part(log: xr.Dataset, *, part: slice, **options: Any) -> xr.Dataset:
     tables = _kept_tables(plan)
     units = [one for one in units_of_work(data.shape[1], unit) if one.start < part.stop and one.stop > part.start]
     begin, end = units[0].start * unit.step, last_sample(units[-1], unit)
-    cells, means = [], []
+    cells, means, space = [], [], Workspace()
     for line in _rows(data, begin, end):
-        done = [_work(line[one.start * unit.step - begin : last_sample(one, unit) - begin], unit, tables) for one in units]
+        done = [_work(line[one.start * unit.step - begin : last_sample(one, unit) - begin], unit, tables, space) for one in units]
         cells.append(np.concatenate([one[0] for one in done], axis=1))
         means.append(np.concatenate([one[1] for one in done], axis=1))
     kept = slice(part.start - units[0].start, part.stop - units[0].start)
@@ -229,10 +230,12 @@ def _rows(data: Any, begin: int, end: int) -> Iterator[NDArray[np.generic]]:
         yield from stretch(data[row : row + together], begin, end)
 
 
-def _work(x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _work(
+    x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...], space: Workspace | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Cells (9, n_windows, n_tau), the last field the degrees of freedom, and means (2, n_windows) of one unit."""
     x = np.ascontiguousarray(x)
-    cells, means = surface_unit(x, unit)
+    cells, means = surface_unit(x, unit, space)
     scale = HOUR if unit.angle else 1.0  # angles are in degree, so their slopes in degree per second
     cells[0] *= scale**2
     dof = identify_noise(cells[0], cells[5], cells[6], cells[7], cells[3], *tables)

@@ -19,21 +19,30 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.vectors import TOGETHER, split_sums
+from gyrostab.kernels.integrate import TILE, integrate_tile, thin_pyramid
+from gyrostab.kernels.vectors import IN_A_ROW, TOGETHER, split_sums
 
-__all__ = ["full_counts", "grouped_blocks", "groups", "windows_from_blocks"]
+__all__ = ["full_counts", "grouped_blocks", "groups", "held_points", "windows_from_blocks"]
 
-# Points of the angle in one pass: what several averaging factors read of them stays in the first-level cache.
-_TILE = 2048
+# Points that a group of averaging factors goes through before the next one does: so few that they stay in the second-level cache, so many
+# that the processor can foresee where the loops of short blocks end.
+_STRETCH = 65536
 
 
-def groups(shifts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """First averaging factor of each group that goes through the angle together (one shift, `TOGETHER` at most), and the end."""
+def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """First averaging factor of each group that goes through the angle together, and the end.
+
+    The factors of a group have one shift; there are `TOGETHER` of them at most, or `IN_A_ROW` that follow each other.
+    """
     starts = np.flatnonzero(np.diff(shifts)) + 1
+    lags = ks >> shifts
     first: list[int] = []
-    for begin, end in zip([0, *starts], [*starts, shifts.size], strict=True):
-        first.extend(range(begin, end, TOGETHER))
-        if (end - begin) % TOGETHER == 1 and end - begin > TOGETHER:
+    for at, end in zip([0, *starts], [*starts, shifts.size], strict=True):
+        while at + IN_A_ROW <= end and lags[at + IN_A_ROW - 1] - lags[at] == IN_A_ROW - 1:
+            first.append(at)
+            at += IN_A_ROW
+        first.extend(range(at, end, TOGETHER))
+        if (end - at) % TOGETHER == 1 and end - at > TOGETHER:
             first[-1] -= 1  # two and a few rather than one alone
     return np.array([*first, shifts.size])
 
@@ -56,47 +65,117 @@ def _limit(i, count, first, high, stop, step, block, n_windows, ks, shifts, head
     return largest
 
 
-@njit(**KERNEL)
-def grouped_blocks(flat, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, counted):  # type: ignore[no-untyped-def]
-    """Heads and tails of every block and averaging factor, (n_blocks, n_tau), and their numbers of terms if `counted`.
-
-    `starts`, `stops` are runs of present points of the angle; ``flat[places[i]:]`` is the angle thinned by ``2**shifts[i]``;
-    `whole` is not rising.
-    """
-    n_blocks = n_windows + whole[0]
-    n_counted = n_blocks if counted else 0
-    heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
-    head_counts, tail_counts = np.zeros((n_counted, ks.size)), np.zeros((n_counted, ks.size))
-    near = np.zeros(groups.size, np.int64)
-    lags = ks >> shifts
-    splits, sizes, out = np.empty(TOGETHER, np.int64), np.empty(TOGETHER, np.int64), np.empty(2 * TOGETHER)
+@njit(**INNER)
+def _add_stretch(  # type: ignore[no-untyped-def]
+    flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups, head_lengths, whole, n_windows,
+    near, splits, sizes, out,
+):  # fmt: skip
+    """Add what the blocks from `begin` to `end` have behind `tile` samples, `_STRETCH` of each at most; `near`: the first runs in reach."""
+    heads, tails = out[0].reshape(-1), out[1].reshape(-1)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
-    for block in range(n_blocks):
-        a = block * step
-        for sub in range(a, a + step, _TILE):
-            for g in range(groups.size - 1):
-                i = groups[g]
-                shift = shifts[i]
-                if (sub - a) & ((_TILE << shift) - 1):
-                    continue
-                high = min(sub + (_TILE << shift), a + step)
-                while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= sub:
-                    near[g] += 1
-                for r in range(near[g], stops.size):
-                    if starts[r] >= high:
-                        break
-                    low = max(sub, starts[r])
-                    first = (low + (1 << shift) - 1) >> shift
-                    count = groups[g + 1] - i
-                    if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
-                        split_sums(flat, places[i] + first, count, lags, i, splits, sizes, out)
+    for g in range(groups.size - 1):
+        i = groups[g]
+        count = groups[g + 1] - i
+        shift = shifts[i]
+        for block in range(begin, end):
+            low = block * step + tile
+            high = min(low + _STRETCH, (block + 1) * step)
+            while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= low:
+                near[g] += 1
+            for r in range(near[g], stops.size):
+                if starts[r] >= high:
+                    break
+                first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
+                if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
+                    place = places[i] + first - (base >> shift)
+                    split_sums(flat, place, count, lags, i, splits, sizes, heads, tails, block * ks.size + i)
+                    if out.shape[0] > 2:
                         for q in range(count):
-                            heads[block, i + q] += out[q]
-                            tails[block, i + q] += out[count + q]
-                            if counted:
-                                head_counts[block, i + q] += splits[q]
-                                tail_counts[block, i + q] += sizes[q] - splits[q]
-    return heads, tails, head_counts, tail_counts
+                            out[2, block, i + q] += splits[q]
+                            out[3, block, i + q] += sizes[q] - splits[q]
+
+
+@njit(**INNER)
+def _move_to_front(flat, capacity, levels, by, held):  # type: ignore[no-untyped-def]
+    """Move the points from `by` to `held` of ``flat[:capacity]`` to its beginning, and those of the thinned levels behind it."""
+    place, size = 0, capacity
+    for level in range(levels + 1):
+        shift = np.int64(by >> level)
+        part = flat[place : place + ((held - 1) >> level) + 1]
+        for m in range(part.size - shift):
+            part[m] = part[m + shift]
+        place += size
+        size = (size + 1) // 2
+
+
+def held_points(n_points: int, step: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> int:
+    """Points of the angle that `grouped_blocks` needs room for: what its terms reach twice over, and no more than there are."""
+    whole = 1 << int(shifts.max(initial=0))
+    wanted = 4 * int(ks[-1]) + 2 * max(step, _STRETCH) + TILE + whole
+    return -(-min(wanted, n_points) // whole) * whole
+
+
+@njit(**KERNEL)
+def grouped_blocks(  # type: ignore[no-untyped-def]
+    x, offset, flat, capacity, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, out
+):  # fmt: skip
+    """Heads and tails of every block and averaging factor, and their numbers of terms, into `out` (2 or 4, n_blocks, n_tau).
+
+    The angle is integrated as the blocks need it, and of what has been integrated only so much is held that it stays in the cache.
+
+    Parameters
+    ----------
+    x : ndarray (n,)
+        Rates, or nothing where `flat` holds the angle already.
+    offset : float
+        Taken from each rate.
+    flat, capacity, places : float64, int, int64 (n_tau,)
+        Room for so many points of the angle (see `held_points`) and their thinned levels (see `pyramid_places`); where the level of each
+        averaging factor begins.
+    starts, stops : int64 (n_runs,)
+        Runs of present points of the angle, one more each than of present rates.
+    step, ks, shifts, groups, head_lengths, whole, n_windows
+        Samples of a block; averaging factors, their thinning (`flat` holds the angle thinned by ``2**shifts[i]``) and groups; terms of a
+        head; blocks of a window, not rising; windows: there are ``n_windows + whole[0]`` blocks.
+    out : float64 (2 or 4, n_blocks, n_tau)
+        Overwritten.
+
+    Returns
+    -------
+    float
+        Largest magnitude of the angle that was integrated.
+    """
+    n_blocks = out.shape[1]
+    near, ends = np.zeros(groups.size, np.int64), stops - 1
+    lags = ks >> shifts
+    splits, sizes = np.empty(IN_A_ROW, np.int64), np.empty(IN_A_ROW, np.int64)
+    levels, together = shifts[-1], max(1, _STRETCH // step)
+    base = done = run = np.int64(0)
+    total = largest = 0.0
+    if x.size > 0:
+        flat[0] = 0.0
+        thin_pyramid(flat, capacity, levels, base, base + 1)
+    for begin in range(0, n_blocks, together):
+        end = min(begin + together, n_blocks)
+        out[:, begin:end] = 0.0
+        for tile in range(0, step, _STRETCH):
+            first = begin * step + tile
+            needed = min((end - 1) * step + min(tile + _STRETCH, step) + 2 * ks[-1], x.size)
+            while done < needed:
+                b = min(done + TILE, x.size)
+                if b + 1 - base > capacity:
+                    by = (first >> levels << levels) - base
+                    _move_to_front(flat, capacity, levels, by, done + 1 - base)
+                    base += by
+                total, reached, run = integrate_tile(x, offset, starts, ends, done, b, total, run, flat[done - base : b + 1 - base])
+                largest = max(largest, reached)
+                thin_pyramid(flat, capacity, levels, done + 1 - base, b + 1 - base)
+                done = b
+            _add_stretch(
+                flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups, head_lengths, whole, n_windows,
+                near, splits, sizes, out,
+            )  # fmt: skip
+    return largest
 
 
 @njit(**INNER)
@@ -122,9 +201,8 @@ def _slide(heads, tails, length, first, stop, out):  # type: ignore[no-untyped-d
 
 
 @njit(**KERNEL)
-def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-untyped-def]
+def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-def]
     """``out[j, i] = sum(heads[j : j + whole[i], i] + tails[...]) + heads[j + whole[i], i]``, additions only."""
-    out = np.empty((n_windows, whole.size))
     first = np.int64(0)
     while first < whole.size:
         stop = first + 1
@@ -133,11 +211,10 @@ def windows_from_blocks(heads, tails, whole, n_windows):  # type: ignore[no-unty
         if whole[first] > 0:
             _slide(heads, tails, whole[first], first, stop, out)
         else:
-            for j in range(n_windows):
+            for j in range(out.shape[0]):
                 for i in range(first, stop):
                     out[j, i] = heads[j, i]
         first = stop
-    return out
 
 
 def full_counts(window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -195,7 +195,8 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
                 if block < n_windows + whole - 1:
                     _add_pairs(theta, places, mask, a + head, a + step, k, stride, tails[block])
             last = j + whole
-    sums = windows_from_blocks(heads, tails, np.full(6, whole), n_windows)
+    sums = np.empty((n_windows, 6))
+    windows_from_blocks(heads, tails, np.full(6, whole), sums)
     out = np.zeros((n_windows, 6))
     for j in range(n_windows):
         if poor[j] and sums[j, 4] > 0.0:

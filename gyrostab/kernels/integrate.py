@@ -14,9 +14,11 @@ from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.vectors import LANES, TOGETHER
 
 __all__ = [
+    "TILE",
     "block_sums",
     "first_present",
     "integrate",
+    "integrate_tile",
     "integrate_two",
     "needs_two_doubles",
     "present_runs",
@@ -26,8 +28,8 @@ __all__ = [
 
 # Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
-# Samples that are integrated, measured and thinned while they are in the cache.
-_TILE = 4096
+#: Samples that are integrated, measured and thinned while they are in the cache.
+TILE = 4096
 # Samples that are looked at one by one where some of them are missing.
 _LOOK = 512
 # Samples that are seen together to be all present or all missing.
@@ -179,41 +181,45 @@ def thin_pyramid(flat, n_points, levels, a, b):  # type: ignore[no-untyped-def]
     size = n_points
     for _ in range(levels):
         a, b = (a + 1) // 2, (b + 1) // 2
-        source = flat[place + 2 * a : place + min(size, 2 * b) : 2]
+        source = flat[place + 2 * a : place + min(size, 2 * b)]
         target = flat[place + size + a : place + size + b]
-        for i in range(target.size):
-            target[i] = source[i]
+        for i in range(np.uint64(target.size)):
+            target[i] = source[np.uint64(2) * i]
         place += size
         size = (size + 1) // 2
 
 
-@njit(**KERNEL)
-def integrate(x, offset, starts, stops, flat, levels):  # type: ignore[no-untyped-def]
-    """Angle ``theta[m] = sum(x[:m] - offset)`` over the runs of present samples, gaps adding nothing, and its thinned levels.
+@njit(**INNER)
+def integrate_tile(x, offset, starts, stops, a, b, total, run, theta):  # type: ignore[no-untyped-def]
+    """``theta[m - a] = total + sum(x[a:m] - offset)`` for ``a < m <= b``, gaps adding nothing; `run` is the first that ends after a.
 
-    Fills ``flat[: n + 1]`` and the `levels` behind it (see `pyramid_places`); returns the largest magnitude.
+    Returns the last angle, the largest magnitude, and the first run that ends after b.
     """
-    theta = flat[: x.size + 1]
+    m = a
+    while m < b:
+        if run < starts.size and starts[run] <= m:
+            end = min(stops[run], b)
+            total = _integrate_run(x[m:end], offset, total, theta[m + 1 - a : end + 1 - a])
+            if end == stops[run]:
+                run += 1
+        else:
+            end = min(starts[run], b) if run < starts.size else b
+            theta[m + 1 - a : end + 1 - a] = total
+        m = end
+    return total, _largest(theta[1 : b + 1 - a]), run
+
+
+@njit(**KERNEL)
+def integrate(x, offset, starts, stops, theta):  # type: ignore[no-untyped-def]
+    """Angle ``theta[m] = sum(x[:m] - offset)``, (n + 1,), over the runs of present samples, gaps adding nothing; its largest magnitude."""
     theta[0] = 0.0
     total = 0.0
     largest = 0.0
     run = 0
-    thin_pyramid(flat, theta.size, levels, np.int64(0), np.int64(1))
-    for a in range(0, x.size, _TILE):
-        b = min(a + _TILE, x.size)
-        m = a
-        while m < b:
-            if run < starts.size and starts[run] <= m:
-                end = min(stops[run], b)
-                total = _integrate_run(x[m:end], offset, total, theta[m + 1 : end + 1])
-                if end == stops[run]:
-                    run += 1
-            else:
-                end = min(starts[run], b) if run < starts.size else b
-                theta[m + 1 : end + 1] = total
-            m = end
-        largest = max(largest, _largest(theta[a + 1 : b + 1]))
-        thin_pyramid(flat, theta.size, levels, a + 1, b + 1)
+    for a in range(0, x.size, TILE):
+        b = min(a + TILE, x.size)
+        total, reached, run = integrate_tile(x, offset, starts, stops, a, b, total, run, theta[a : b + 1])
+        largest = max(largest, reached)
     return largest
 
 
@@ -271,4 +277,4 @@ def pyramid_places(n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int6
             size = (size + 1) // 2
             shift += 1
         begin[i] = place
-    return begin, int(place + size + 2 * apart + LANES)
+    return begin, int(place + size + 2 * apart + 2 * LANES)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.blocks import full_counts, grouped_blocks, groups, windows_from_blocks
+from gyrostab.kernels.blocks import full_counts, grouped_blocks, groups, held_points, windows_from_blocks
 from gyrostab.kernels.clusters import cluster_cells, cluster_factor, cluster_strides, integrate_places, pack_mask
 from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.integrate import (
@@ -23,6 +23,7 @@ from gyrostab.kernels.integrate import (
 )
 from gyrostab.kernels.intervals import single_blocks, valid_intervals
 from gyrostab.kernels.pairs import strict_gap_factors
+from gyrostab.kernels.workspace import Workspace
 
 __all__ = ["CELL_FIELDS", "NONE", "STRICT", "WEIGHTED", "Unit", "surface_unit", "window_means"]
 
@@ -69,20 +70,20 @@ class Unit(NamedTuple):
 
 @njit(**KERNEL)
 def _fill(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[no-untyped-def]
-    """Cells from sums of squares; `counts` is empty where nothing is missing."""
+    """Cells from sums of squares; `counts` is empty where nothing is missing. No term leaves no sum, and 0 / 0 is NaN."""
+    scale = 2.0 * (ks * interval) * (ks * interval)
     for j in range(sums.shape[0]):
+        used = counts[j] if counts.size > 0 else full[j]
+        divisor = full[j] if zero_fill else used
         for i in range(ks.size):
-            count = full[j, i] if counts.size == 0 else counts[j, i]
-            divisor = full[j, i] if zero_fill else count
-            span = ks[i] * interval
-            cells[0, j, i] = sums[j, i] / (2.0 * span * span * divisor) if divisor > 0 else np.nan
-            cells[1, j, i] = count
-            cells[2, j, i] = count / full[j, i]
-            cells[3, j, i] = 1.0
-            cells[4, j, i] = STRICT
-            cells[5, j, i] = 1.0
-            cells[6, j, i] = 1.0
-            cells[7, j, i] = 1.0
+            cells[0, j, i] = sums[j, i] / (scale[i] * divisor[i])
+        for i in range(ks.size):
+            cells[1, j, i] = used[i]
+        for i in range(ks.size):
+            cells[2, j, i] = used[i] / full[j, i]
+        cells[3, j] = 1.0
+        cells[4, j] = STRICT
+        cells[5:8, j] = 1.0
 
 
 @njit(**KERNEL)
@@ -124,15 +125,12 @@ def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells): 
                 cells[7, j, i] = bridged[j, 5]
 
 
-class _Angle(NamedTuple):
-    """Angle of a unit: every level of thinning in one array, where each begins, the remainders (or nothing), runs of present points."""
+class _Present(NamedTuple):
+    """Runs of present samples, and what is taken from each rate."""
 
-    flat: Floats
-    rest: Floats
-    places: Integers
-    points: int
     starts: Integers
     stops: Integers
+    offset: float
 
 
 def _line_removed(x: NDArray[np.generic], starts: Integers, stops: Integers) -> Floats:
@@ -143,47 +141,71 @@ def _line_removed(x: NDArray[np.generic], starts: Integers, stops: Integers) -> 
     return np.where(np.isfinite(values), values - line, 0.0)
 
 
-def _angle(x: NDArray[np.generic], unit: Unit, starts: Integers, stops: Integers, offset: float) -> _Angle:
-    """Local angle of the unit, for rates the integral of ``x - offset``."""
-    points = x.size + (0 if unit.angle else 1)
-    places, size = pyramid_places(points, unit.ks, unit.shifts)
-    flat, rest = np.empty(size), np.empty(0)
-    levels = int(unit.shifts.max(initial=0))
-    if unit.angle:
-        flat[:points] = _line_removed(x, starts, stops)
-        thin_pyramid(flat, points, levels, 0, points)
-    elif needs_two_doubles(integrate(x, offset, starts, stops, flat, levels), x):
-        rest = np.empty(size)
-        integrate_two(x, offset, starts, stops, flat[:points], rest[:points])
-        thin_pyramid(flat, points, levels, 0, points)
-        thin_pyramid(rest, points, levels, 0, points)
-    return _Angle(flat, rest, places, points, starts, stops if unit.angle else stops + 1)
-
-
-def _strict_sums(angle: _Angle, unit: Unit, n_windows: int, gaps: bool) -> tuple[Floats, Floats]:
+def _strict_sums(
+    x: NDArray[np.generic], unit: Unit, present: _Present, n_windows: int, gaps: bool, space: Workspace
+) -> tuple[Floats, Floats]:
     """Sums of squared second differences of every window and averaging factor, and numbers of terms (empty where all are there)."""
     lengths = unit.window - 2 * unit.ks + 1
     whole = lengths // unit.step
     rest = lengths - whole * unit.step
-    if angle.rest.size or (unit.angle and angle.starts.size > 1):
-        starts, stops = angle.starts, angle.stops if unit.angle else angle.stops - 1
-        heads, tails, head_counts, tail_counts = single_blocks(
-            angle.flat, angle.rest, angle.places, starts, stops, unit.angle, unit.step, unit.ks, unit.shifts, rest, whole, n_windows
-        )
+    blocks = space.array("blocks", 4 if gaps else 2, n_windows + int(whole[0]), unit.ks.size)
+    add = _angle_blocks if unit.angle else _rate_blocks
+    add(x, unit, present, (rest, whole, n_windows), blocks, space)
+    sums = space.array("sums", len(blocks) // 2, n_windows, unit.ks.size)
+    for heads_and_tails, out in zip((blocks[:2], blocks[2:]), sums, strict=False):
+        windows_from_blocks(*heads_and_tails, whole, out)
+    return sums[0], sums[1] if gaps else np.empty((0, 0))
+
+
+def _rate_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tuple[Any, ...], blocks: Floats, space: Workspace) -> None:
+    """Heads and tails of rates, from an angle that is held as far as terms reach; or, where that is too large, from one of two doubles."""
+    starts, stops, offset = present
+    ks, shifts = unit.ks, unit.shifts
+    points = held_points(x.size + 1, unit.step, ks, shifts)
+    places, size = pyramid_places(points, ks, shifts)
+    flat = space.array("angle", size)
+    runs, order = (starts, stops + 1), (ks, shifts, groups(ks, shifts))
+    largest = grouped_blocks(x, offset, flat, points, places, *runs, unit.step, *order, *cut, blocks)
+    if not needs_two_doubles(largest, x):
+        return
+    places, size = pyramid_places(x.size + 1, ks, shifts)
+    high, low = space.array("angle", size), space.array("rest of the angle", size)
+    integrate_two(x, offset, starts, stops, high[: x.size + 1], low[: x.size + 1])
+    for part in (high, low):
+        thin_pyramid(part, x.size + 1, int(shifts[-1]), 0, x.size + 1)
+    blocks[:] = single_blocks(high, low, places, starts, stops, unit.angle, unit.step, ks, shifts, *cut)[: len(blocks)]
+
+
+def _angle_of(x: NDArray[np.generic], present: _Present, windows: Integers, unit: Unit, space: Workspace) -> Floats:
+    """Angle of all samples, (n + 1,), that has its values from the first of some windows to the block behind the last of them."""
+    first, last = windows[0] * unit.step, min((windows[-1] + 1) * unit.step + unit.window, x.size)
+    angle = space.array("angle", x.size + 1)
+    starts, stops = (np.clip(edges, first, last) - first for edges in present[:2])
+    some = starts < stops
+    integrate(x[first:last], present.offset, starts[some], stops[some], angle[first : last + 1])
+    return angle
+
+
+def _angle_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tuple[Any, ...], blocks: Floats, space: Workspace) -> None:
+    """Heads and tails of angles, which are all there already."""
+    starts, stops, _ = present
+    ks, shifts = unit.ks, unit.shifts
+    places, size = pyramid_places(x.size, ks, shifts)
+    flat = space.array("angle", size)
+    flat[: x.size] = _line_removed(x, starts, stops)
+    thin_pyramid(flat, x.size, int(shifts[-1]), 0, x.size)
+    if starts.size > 1:
+        blocks[:] = single_blocks(flat, flat[:0], places, starts, stops, unit.angle, unit.step, ks, shifts, *cut)[: len(blocks)]
     else:
-        runs, order = (angle.starts, angle.stops), (unit.ks, unit.shifts, groups(unit.shifts))
-        heads, tails, head_counts, tail_counts = grouped_blocks(
-            angle.flat, angle.places, *runs, unit.step, *order, rest, whole, n_windows, gaps
-        )
-    sums = windows_from_blocks(heads, tails, whole, n_windows)
-    return sums, windows_from_blocks(head_counts, tail_counts, whole, n_windows) if gaps else np.empty((0, 0))
+        order = (ks, shifts, groups(ks, shifts))
+        grouped_blocks(np.empty(0), 0.0, flat, x.size, places, starts, stops, unit.step, *order, *cut, blocks)
 
 
 def _native(x: NDArray[np.generic]) -> NDArray[np.generic]:
     return np.ascontiguousarray(x if x.dtype in _NATIVE else x.astype(np.float64))
 
 
-def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
+def surface_unit(x: NDArray[np.generic], unit: Unit, space: Workspace | None = None) -> tuple[Floats, Floats]:
     """Cells and means of the windows that start in a stretch of one axis.
 
     Parameters
@@ -193,18 +215,21 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
         Windows start at samples 0, step, 2 step ... and every window lies inside the stretch.
     unit : Unit
         Window, step, averaging factors and rules.
+    space : Workspace, optional
+        Memory to work in, for units one after the other; what the last one returned is overwritten.
 
     Returns
     -------
     cells : ndarray (8, n_windows, n_tau)
-        The fields of `CELL_FIELDS`; the variance is in the square of the rate's unit (for angles: of angle per second).
+        The fields of `CELL_FIELDS`, in the memory of `space`; the variance is in the square of the rate's unit (for angles: of angle
+        per second).
     means : ndarray (2, n_windows)
         As `window_means`.
     """
     counts_only = np.issubdtype(x.dtype, np.integer)
-    x = _native(x)
+    x, space = _native(x), space or Workspace()
     n_windows = _number_of_windows(x, unit)
-    cells = np.empty((len(CELL_FIELDS), n_windows, unit.ks.size))
+    cells = space.array("cells", len(CELL_FIELDS), n_windows, unit.ks.size)
     means, mean, known = _means(x, unit, n_windows)
     present = int(known.sum())
     if present == 0:
@@ -213,8 +238,8 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
         return cells, means
     gaps = present < x.size
     starts, stops = present_runs(x, unit.step if known.size > 1 else x.size, known) if gaps else (np.zeros(1, np.int64), np.full(1, x.size))
-    angle = _angle(x, unit, starts, stops, float(np.rint(mean)) if counts_only else mean)  # integers less an integer: every sum is exact
-    sums, counts = _strict_sums(angle, unit, n_windows, gaps)
+    offset = float(np.rint(mean)) if counts_only else mean  # integers less an integer: every sum is exact
+    sums, counts = _strict_sums(x, unit, _Present(starts, stops, offset), n_windows, gaps, space)
     full = full_counts(unit.window, unit.step, n_windows, unit.ks, unit.shifts)
     _fill(sums, counts, full, unit.zero_fill, unit.ks, unit.interval if unit.angle else 1.0, cells)
     if gaps:
@@ -222,7 +247,8 @@ def surface_unit(x: NDArray[np.generic], unit: Unit) -> tuple[Floats, Floats]:
         poor = counts < unit.min_strict * full
         if not unit.zero_fill and not unit.angle and poor.any():
             strides = cluster_strides(unit.window, unit.ks, unit.shifts)
-            _bridge_gaps(angle.flat[: angle.points], starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
+            angle = _angle_of(x, _Present(starts, stops, offset), np.flatnonzero(poor.any(axis=1)), unit, space)
+            _bridge_gaps(angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
     if gaps and not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
         cells[0][blank] = cells[5][blank] = cells[6][blank] = cells[7][blank] = np.nan
@@ -244,7 +270,8 @@ def _means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> tuple[Floats, 
         return np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)]), np.nan, np.zeros(1)
     heads, tails = block_sums(x, base, unit.window, unit.step, n_windows)  # less the first sample: small on a tool that turns
     total, present = heads.sum(axis=0) + tails.sum(axis=0)
-    windows = windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), n_windows)
+    windows = np.empty((n_windows, 2))
+    windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), windows)
     with np.errstate(invalid="ignore", divide="ignore"):
         means = np.stack([base + windows[:, 0] / windows[:, 1], windows[:, 1] / unit.window])
     return means, base + total / present, heads[:, 1] + tails[:, 1]

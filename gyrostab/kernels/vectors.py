@@ -1,8 +1,10 @@
 """The inner loop of the Allan variance in vectors of eight: squared second differences of several lags in one pass.
 
 Left alone, a compiler takes one lag at a time, in vectors half as wide as many processors have. Here several lags share
-the loads of ``theta[m]``, and vectors of a stated width are used whole: twice to three times the terms per second. Where
-the processor has shorter vectors, the compiler splits these. The order of additions is the same on every machine.
+the loads of ``theta[m]``, and vectors of a stated width are used whole: twice to three times the terms per second. Most of
+the time then goes to loads that begin in one line of the cache and end in the next. Lags that follow each other need few of
+these, as each takes its elements out of two vectors that all of them share. Where the processor has shorter vectors, the
+compiler splits these. The order of additions is the same on every machine.
 """
 
 from __future__ import annotations
@@ -18,12 +20,12 @@ from numba.extending import intrinsic
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["LANES", "TOGETHER", "split_sums"]
+__all__ = ["IN_A_ROW", "LANES", "TOGETHER", "split_sums"]
 
 #: Elements of a vector.
 LANES = 8
-#: Most lags in one pass.
-TOGETHER = 4
+#: Most lags in one pass, and most of lags that follow each other.
+TOGETHER, IN_A_ROW = 4, 8
 
 _INDEX = ir.IntType(64)
 _SHORT = ir.IntType(32)
@@ -62,23 +64,47 @@ def _while(builder: Any, goes_on: Callable[[], Any]) -> Iterator[None]:
     builder.position_at_end(after)
 
 
+def _vector(builder: Any, theta: Any, index: Any) -> Any:
+    return builder.load(builder.bitcast(builder.gep(theta, [index]), _DOUBLES.as_pointer()), align=8)
+
+
+def _second(builder: Any, first: Any, middle: Any, last: Any) -> Any:
+    minus_two = ir.Constant(_DOUBLES, [-2.0] * LANES)
+    return builder.fadd(builder.fadd(builder.fmul(middle, minus_two, flags=_FAST), last, flags=_FAST), first, flags=_FAST)
+
+
 def _differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
     """Second differences of each lag at ``at ... at + LANES - 1``."""
-
-    def load(index: Any) -> Any:
-        return builder.load(builder.bitcast(builder.gep(theta, [index]), _DOUBLES.as_pointer()), align=8)
-
-    first, minus_two = load(at), ir.Constant(_DOUBLES, [-2.0] * LANES)
+    first = _vector(builder, theta, at)
     found = []
     for lag in lags:
-        middle, last = load(builder.add(at, lag)), load(builder.add(at, builder.add(lag, lag)))
-        outer = builder.fadd(builder.fmul(middle, minus_two, flags=_FAST), last, flags=_FAST)
-        found.append(builder.fadd(outer, first, flags=_FAST))
+        middle = _vector(builder, theta, builder.add(at, lag))
+        last = _vector(builder, theta, builder.add(at, builder.add(lag, lag)))
+        found.append(_second(builder, first, middle, last))
     return found
 
 
-def _add_square(builder: Any, where: Any, value: Any) -> None:
-    builder.store(builder.fadd(builder.load(where), builder.fmul(value, value, flags=_FAST), flags=_FAST), where)
+def _differences_in_a_row(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
+    """The same of lags that follow each other, `IN_A_ROW` at most."""
+    last_needed = len(lags) + LANES - 2
+
+    def vectors(index: Any, reach: int) -> list[Any]:
+        return [_vector(builder, theta, builder.add(index, ir.Constant(_INDEX, by))) for by in range(0, reach + 1, LANES)]
+
+    def taken(found: list[Any], by: int) -> Any:
+        place, by = divmod(by, LANES)
+        return builder.shuffle_vector(found[place], found[place + 1], _places(list(range(by, by + LANES)))) if by else found[place]
+
+    first = _vector(builder, theta, at)
+    middles = vectors(builder.add(at, lags[0]), last_needed)
+    lasts = vectors(builder.add(at, builder.add(lags[0], lags[0])), last_needed + len(lags) - 1)
+    return [_second(builder, first, taken(middles, i), taken(lasts, 2 * i)) for i in range(len(lags))]
+
+
+def _add_square(builder: Any, place: Any, value: Any, where: Any = None) -> None:
+    before = builder.load(place)
+    after = builder.fadd(before, builder.fmul(value, value, flags=_FAST), flags=_FAST)
+    builder.store(after if where is None else builder.select(where, after, before), place)
 
 
 def _halves(builder: Any, first: Any, second: Any, width: int) -> Any:
@@ -103,9 +129,20 @@ def _totals(builder: Any, sums: list[list[Any]]) -> Any:
     return vectors[0]
 
 
-def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: list[Any]) -> list[Any]:
-    """Sums of every lag over ``m < split``, then those over ``split <= m < size``."""
-    steps = _STEPS[len(lags)]
+def _all_totals(builder: Any, heads: list[list[Any]], tails: list[list[Any]]) -> list[Any]:
+    """Sums of all elements of each vector, as one vector for the heads and one for the tails."""
+    count = len(heads)
+    if 2 * count > LANES:
+        return [_totals(builder, sums) for sums in (heads, tails)]
+    both = heads + tails
+    found = _totals(builder, [both[place % len(both)] for place in range(LANES)])  # what is left over is filled with any
+    return [builder.shuffle_vector(found, found, _places(list(range(begin, begin + count)))) for begin in (0, count)]
+
+
+def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: list[Any], *, in_a_row: bool) -> list[Any]:
+    """Vector with the sum of every lag over ``m < split``, and that over ``split <= m < size``."""
+    steps = 1 if in_a_row else _STEPS[len(lags)]
+    differences = _differences_in_a_row if in_a_row else _differences
     nothing = ir.Constant(_DOUBLES, [0.0] * LANES)
     heads, tails = ([[cgutils.alloca_once(builder, _DOUBLES) for _ in range(steps)] for _ in lags] for _ in range(2))
     for place in [place for sums in heads + tails for place in sums]:
@@ -122,7 +159,7 @@ def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: l
     def whole_vectors(limit: Any, sums: list[list[Any]]) -> None:
         with _while(builder, lambda: builder.icmp_signed("<=", advanced(steps * LANES), limit)):
             for step in range(steps):
-                for lag, value in enumerate(_differences(builder, theta, advanced(step * LANES), lags)):
+                for lag, value in enumerate(differences(builder, theta, advanced(step * LANES), lags)):
                     _add_square(builder, sums[lag][step], value)
             builder.store(advanced(steps * LANES), position)
 
@@ -133,74 +170,70 @@ def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: l
         with builder.if_then(builder.icmp_signed("<", builder.load(position), last_size)):
             at = builder.load(position)
             index = builder.add(_splat(builder, at), ir.Constant(_INDICES, list(range(LANES))))
-            for lag, value in enumerate(_differences(builder, theta, at, lags)):
+            for lag, value in enumerate(differences(builder, theta, at, lags)):
                 before = builder.icmp_signed("<", index, wide_splits[lag])
                 inside = builder.icmp_signed("<", index, wide_sizes[lag])
-                value = builder.select(inside, value, nothing)
-                _add_square(builder, heads[lag][0], builder.select(before, value, nothing))
-                _add_square(builder, tails[lag][0], builder.select(before, nothing, value))
+                _add_square(builder, heads[lag][0], value, where=before)
+                _add_square(builder, tails[lag][0], value, where=builder.and_(inside, builder.not_(before)))
             builder.store(advanced(LANES), position)
-    # eight rows, those that no lag has filled with those of another
-    rows = [sums[lag % len(lags)] for sums in (heads, tails) for lag in range(LANES // 2)]
-    found = _totals(builder, rows)
-    places = [lag + part * LANES // 2 for part in range(2) for lag in range(len(lags))]
-    return [builder.extract_element(found, ir.Constant(_SHORT, place)) for place in places]
+    return _all_totals(builder, heads, tails)
 
 
-def _of_lags(count: int) -> Any:
+def _of_lags(count: int, *, in_a_row: bool = False) -> Any:
     """The loop for `count` lags as a function for compiled code, arguments as `split_sums`."""
 
-    def sums(typing_context, theta, first, lags, at, splits, sizes, out):  # type: ignore[no-untyped-def]
+    def sums(typing_context, theta, first, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            starts = [
-                context.make_array(kind)(context, builder, value).data
-                for kind, value in zip(signature.args, args, strict=True)
-                if isinstance(kind, types.Array)
+            arrays = zip(signature.args, args, strict=True)
+            starts = [context.make_array(kind)(context, builder, value).data for kind, value in arrays if isinstance(kind, types.Array)]
+            theta, lags = builder.gep(starts[0], [args[1]]), builder.gep(starts[1], [args[3]])
+            values = [
+                [builder.load(builder.gep(start, [ir.Constant(_INDEX, i)])) for i in range(count)] for start in (lags, starts[2], starts[3])
             ]
-            theta, integers, out = builder.gep(starts[0], [args[1]]), starts[1:4], starts[4]
-            integers[0] = builder.gep(integers[0], [args[3]])
-
-            def place(start: Any, i: int) -> Any:
-                return builder.gep(start, [ir.Constant(_INDEX, i)])
-
-            values = [[builder.load(place(start, i)) for i in range(count)] for start in integers]
-            for i, total in enumerate(_loop(builder, theta, *values)):
-                builder.store(total, place(out, i))
+            some = ir.VectorType(ir.DoubleType(), count).as_pointer()
+            for total, start in zip(_loop(builder, theta, *values, in_a_row=in_a_row), starts[4:], strict=True):
+                row = builder.bitcast(builder.gep(start, [args[8]]), some)
+                builder.store(builder.fadd(builder.load(row, align=8), total), row, align=8)
             return context.get_dummy_value()
 
-        return types.void(theta, types.int64, lags, types.int64, splits, sizes, out), generate
+        return types.void(theta, types.int64, lags, types.int64, splits, sizes, heads, tails, types.int64), generate
 
     return intrinsic(sums)
 
 
 _one, _two, _three, _four = (_of_lags(count) for count in range(1, TOGETHER + 1))
+_eight_in_a_row, _four_in_a_row = (_of_lags(count, in_a_row=True) for count in (IN_A_ROW, TOGETHER))
 
 
 @njit(**KERNEL)
-def split_sums(theta, first, count, lags, at, splits, sizes, out):  # type: ignore[no-untyped-def]
-    """Sums of squared second differences of one to four lags from one place on, in two parts.
+def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
+    """Add squared second differences of one to four lags, or of eight that follow each other, from one place on, in two parts.
 
     Parameters
     ----------
     theta : float64 (n,)
-        Angle, contiguous. Elements up to ``first + max(sizes) + 2 * max(lags) + LANES`` are read; those that no term needs may
+        Angle, contiguous. Elements below ``first + max(sizes) + 2 * max(lags) + 2 * LANES`` are read; those that no term needs may
         have any value.
     first : int
         Index of m = 0.
     count : int
-        Number of lags, 1 to `TOGETHER`.
+        Number of lags: 1 to `TOGETHER`, or `IN_A_ROW`.
     lags, at : int64 (n_lags,), int
-        Averaging factors, used from number `at` on.
+        Averaging factors, rising, used from number `at` on.
     splits, sizes : int64 (count,)
         Terms of the head, ``m < split``; terms of head and tail, ``split <= m < size``.
-    out : float64 (2 * count,)
-        Overwritten: heads, then tails.
+    heads, tails, place : float64 (n,), float64 (n,), int
+        Sums of the two parts, to which is added, from number `place` on.
     """
-    if count == 4:
-        _four(theta, first, lags, at, splits, sizes, out)
+    if count == 8:
+        _eight_in_a_row(theta, first, lags, at, splits, sizes, heads, tails, place)
+    elif count == 4 and lags[at + 3] - lags[at] == 3:
+        _four_in_a_row(theta, first, lags, at, splits, sizes, heads, tails, place)
+    elif count == 4:
+        _four(theta, first, lags, at, splits, sizes, heads, tails, place)
     elif count == 3:
-        _three(theta, first, lags, at, splits, sizes, out)
+        _three(theta, first, lags, at, splits, sizes, heads, tails, place)
     elif count == 2:
-        _two(theta, first, lags, at, splits, sizes, out)
+        _two(theta, first, lags, at, splits, sizes, heads, tails, place)
     else:
-        _one(theta, first, lags, at, splits, sizes, out)
+        _one(theta, first, lags, at, splits, sizes, heads, tails, place)

@@ -1,0 +1,38 @@
+"""Memory that one unit of work after the other uses: large arrays made anew cost as much as the sums that go into them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Workspace"]
+
+# Bytes of a line of the cache; vectors that begin with one are loaded at once.
+_LINE = 64
+
+
+class Workspace:
+    """Arrays of doubles by name, for one thread at a time; an array holds until its name is asked for again.
+
+    Examples
+    --------
+    >>> space = Workspace()
+    >>> angle = space.array("angle", 3, 1000)
+    >>> angle.shape, angle.ctypes.data % 64, np.shares_memory(angle, space.array("angle", 500))
+    ((3, 1000), 0, True)
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[str, NDArray[np.float64]] = {}
+
+    def array(self, name: str, *shape: int) -> NDArray[np.float64]:
+        """An array whose values are whatever was left there, at the beginning of a line of the cache."""
+        size = math.prod(shape)
+        if name not in self._kept or self._kept[name].size < size:
+            self._kept.pop(name, None)
+            memory = np.empty(size + _LINE // 8)
+            begin = -memory.ctypes.data % _LINE // 8
+            self._kept[name] = memory[begin : begin + size]
+        return self._kept[name][:size].reshape(shape)
