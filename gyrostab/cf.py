@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gyrostab.clock import time_of_day
 from gyrostab.errors import FormatError, SchemaError
+from gyrostab.parts import transposed
 from gyrostab.schema import check_log, check_product, check_surface, texts
 from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import ON_DISK, on_disk
@@ -67,7 +68,7 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
         if name in grids:
             variables[f"{name}_start"] = _first_stamp(grids[name], variable.attrs, divisor, since)
             continue
-        stored = _lazy(variable).transpose(*_disk_order(variable.dims)) if name not in dataset.dims else variable
+        stored = transposed(_lazy(variable), _disk_order(variable.dims)) if name not in dataset.dims else variable
         attrs = _attributes_to_disk({"long_name": str(name).replace("_", " "), **variable.attrs})
         data = stored.data if name not in dataset.dims else None
         if variable.dtype.kind == "M":

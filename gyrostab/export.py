@@ -29,6 +29,7 @@ from gyrostab.store import (
     as_counts,
     chunk_samples,
     large_variables,
+    library_lock,
     long_variables,
     open_stored,
 )
@@ -100,11 +101,24 @@ def to_netcdf(
         long = long_variables(packed) if log else large_variables(packed, encoding)
         rest = {name: options for name, options in encoding.items() if name not in long}
         with new_output(path, overwrite=overwrite) as temporary:
-            packed.drop_vars(long).to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=rest)
+            _begin_netcdf(packed.drop_vars(long), temporary, rest)
             (append_netcdf if log else append_deflated)(temporary, long, encoding, progress=progress)
 
     _write_counts(stored, write)
     return Path(path)
+
+
+def _begin_netcdf(rest: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
+    """Write what is not long. `Dataset.to_netcdf` would do, but loads dask.distributed to see whether that is at work."""
+    if any(variable.chunks is not None and variable.size >= CHUNK_VALUES for variable in rest.variables.values()):
+        rest.to_netcdf(path, engine="netcdf4", format="NETCDF4", encoding=encoding)
+        return
+    open_store: Any = xr.backends.NetCDF4DataStore.open
+    store = open_store(path, mode="w", format="NETCDF4", lock=library_lock())
+    try:
+        rest.load().dump_to_store(store, encoding=encoding)
+    finally:
+        store.close()
 
 
 def _netcdf_encoding(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, dict[str, Any]]:

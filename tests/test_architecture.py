@@ -56,3 +56,11 @@ def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         gyrostab.nonsense  # noqa: B018
     assert "davar" in dir(gyrostab)
+
+
+def test_a_file_is_written_without_loading_a_scheduler(tmp_path):
+    """xarray looks whether dask.distributed is at work by loading it: a quarter of a second."""
+    log = f"to_netcdf(make_log(np.arange(60.0), rate=100.0, unit='deg/h'), {str(tmp_path / 'log.nc')!r})"
+    done = _python(f"import sys; import numpy as np; from gyrostab import make_log, to_netcdf; {log}; print('distributed' in sys.modules)")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "False"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pty
 import re
@@ -188,6 +189,21 @@ def test_an_interrupt_while_the_program_loads_is_exit_code_3(monkeypatch, capsys
     assert "interrupted" in capsys.readouterr().err
 
 
+def test_cycles_are_looked_for_seldom_and_afterwards_as_before(monkeypatch):
+    before, found = gc.get_threshold(), []
+
+    class Failing(list):
+        def __call__(self, *arguments, **options) -> None:
+            found.append(gc.get_threshold())
+            raise RuntimeError("no")
+
+    monkeypatch.setattr("gyrostab.cli.app", Failing())
+    assert call("scan", "log.csv") == 1
+    assert found[0][0] >= 10 * before[0]
+    assert found[0][1:] == before[1:]
+    assert gc.get_threshold() == before
+
+
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
     path = write_log(tmp_path / "long.csv")
@@ -195,12 +211,12 @@ def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
         "import os, signal, sys, xarray\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background starts with it ignored\n"
         "from gyrostab.cli import main\n"
-        "write = xarray.Dataset.to_netcdf\n"
+        "write = xarray.Dataset.dump_to_store\n"
         "def slow(dataset, target, **options):\n"
         "    written = write(dataset, target, **options)\n"
         f"    os.kill(os.getpid(), signal.{name})\n"
         "    return written\n"
-        "xarray.Dataset.to_netcdf = slow\n"
+        "xarray.Dataset.dump_to_store = slow\n"
         f"sys.exit(main(['ingest', {str(path)!r}, '-o', {str(tmp_path / 'log.nc')!r}]))"
     )
     stopped(code, exit_code=3, says="interrupted")

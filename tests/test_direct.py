@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from itertools import pairwise
 
 import dask.array as da
 import netCDF4
@@ -16,12 +17,13 @@ from gyrostab.export import open_log
 from gyrostab.fit import fit_noise, fit_part
 from gyrostab.join import join_logs
 from gyrostab.join.lazy import lay
+from gyrostab.parts import read_part, transposed, with_part
 from gyrostab.read.buffers import lazily
 from gyrostab.read.pieces import Spool
 from gyrostab.regularise import fill
 from gyrostab.regularise.place import Placement
 from gyrostab.run import checkpoint, load_log, run
-from gyrostab.store import header, read, write
+from gyrostab.store import deflate, header, read, write
 from gyrostab.store.direct import can_fill, end_to_end, fill_row, held, one_row, stack_rows, stretch
 from gyrostab.store.header import read_header
 
@@ -181,6 +183,52 @@ def test_a_large_product_is_that_of_the_small_way(tmp_path, monkeypatch):
         run(paths, tmp_path / "large.nc", windows=WINDOW)
     small, large = (open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False) for name in ("small", "large"))
     xr.testing.assert_identical(small, large)
+
+
+def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_path, monkeypatch):
+    """Every read of their blocks by dask would be one of the tasks that are named after the job."""
+    paths, asked = stored_logs(tmp_path, "zarr"), []
+    lazily = checkpoint._lazily
+
+    def watched(blocks, name):
+        found = lazily(blocks, name)
+        seen = found.map_blocks(lambda values: asked.append(name) or values, dtype=found.dtype, meta=found._meta)
+        return with_part(seen, found.gyrostab_part)
+
+    monkeypatch.setattr(checkpoint, "_SMALL", 0)
+    monkeypatch.setattr(checkpoint, "_lazily", watched)
+    monkeypatch.setattr(deflate, "_LARGE", 1000)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        run(paths, tmp_path / "large.nc", windows=WINDOW)
+        monkeypatch.setattr(checkpoint, "_SMALL", 2**30)
+        run(paths, tmp_path / "small.nc", windows=WINDOW)
+    small, large = (open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False) for name in ("small", "large"))
+    xr.testing.assert_identical(small, large)
+    assert small.edf.size >= 1000 > small.N.size
+    assert "N" in asked
+    assert "edf" not in asked
+
+
+def test_a_part_of_a_variable_in_blocks_is_that_of_the_whole(tmp_path):
+    """Pieces that lie in one stretch of a block and pieces that do not, across the edges of blocks."""
+    rng, edges = np.random.default_rng(3), [0, 4, 5, 11]
+    cube = rng.standard_normal((3, 11, 4))
+    blocks = []
+    for begin, end in pairwise(edges):
+        part = xr.Dataset({"avar": (("axis", "time", "tau"), cube[:, begin:end])}, coords={"time": np.arange(begin, end)})
+        blocks.append(checkpoint.write_block(tmp_path, slice(begin, end), part, job="j"))
+    array = checkpoint._lazily(blocks, "avar")
+    np.testing.assert_array_equal(array.compute(), cube)
+    for _ in range(200):
+        place = tuple(slice(*np.sort(rng.choice(size + 1, 2, replace=False))) for size in cube.shape)
+        np.testing.assert_array_equal(read_part(array, place), cube[place])
+    turned = transposed(xr.Variable(("axis", "time", "tau"), array), ("tau", "axis", "time"))
+    np.testing.assert_array_equal(read_part(turned.data, (slice(1, 3), slice(0, 1), slice(3, 9))), cube.transpose(2, 0, 1)[1:3, :1, 3:9])
+    assert hasattr(turned.data, "gyrostab_part")
+    blocks[1].path.write_bytes(blocks[1].path.read_bytes()[: blocks[1].begin + 5])
+    with pytest.raises(OSError, match="is cut short"):
+        read_part(array, (slice(0, 1), slice(0, 11), slice(0, 4)))
 
 
 @pytest.mark.parametrize("options", [{}, {"terms": "NK"}, {"method": "adev"}, {"tau_min": "0.1s"}])

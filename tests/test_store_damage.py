@@ -11,10 +11,14 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
+from numcodecs import Blosc
 
 import gyrostab
+import gyrostab.store.layout as layout_module
+import gyrostab.store.read as read_module
 from gyrostab.errors import FormatError
 from gyrostab.export import open_log, to_zarr
+from gyrostab.store.direct import fill_row
 from gyrostab.timegrid import time_coordinate
 
 from .stored import CHUNK, START, WRITERS, counts_log, same_bits, spoil
@@ -62,6 +66,30 @@ def test_a_damaged_chunk_becomes_a_gap_and_is_told_once(tmp_path, form, how):
         log.rate.compute()
     with open_log(path, strict=True) as log:
         assert same_bits(log.rate[0], wanted[0])  # strict or not, what is sound is read
+
+
+@pytest.mark.parametrize("content", [b"", bytes(20), Blosc("lz4").encode(b"abc"), Blosc("lz4").encode(bytes(7))])
+def test_a_chunk_of_a_few_bytes_is_damaged(tmp_path, content):
+    """Not long enough for a header of blosc, for a checksum, or for a sample."""
+    path = to_zarr(counts_log(), tmp_path / "log.zarr")
+    (path / "rate" / "1.1").write_bytes(content)
+    with open_log(path) as log, pytest.warns(UserWarning, match=r"axis y: the chunk from .* is damaged: rate/1\.1: "):
+        assert np.isnan(log.rate.values[1]).sum() == CHUNK
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_chunks_that_are_kept_take_no_more_memory_than_they_may(tmp_path, monkeypatch, form):
+    """Parts of the same chunks, in turn: read once while they fit, read anew when others have taken their place."""
+    kept, chunk = read_module._Kept(4 * CHUNK * 2), 4 * CHUNK
+    decoded = []
+    monkeypatch.setattr(read_module, "_KEPT", kept)
+    monkeypatch.setattr(read_module, "read_chunk", lambda *where, **how: decoded.append(where) or layout_module.read_chunk(*where, **how))
+    with open_log(WRITERS[form](counts_log(), tmp_path / f"log.{form}")) as log:
+        for place in (0, 1, 0, 1, 2, 0):
+            fill_row(log.rate.data, 1, place * CHUNK + 10, part := np.empty(10))
+            np.testing.assert_array_equal(part, counts_log().rate[1, place * CHUNK + 10 : place * CHUNK + 20])
+            assert sum(one.nbytes for one in kept._chunks.values()) == kept._held <= 2 * chunk
+    assert [where[2] for where in decoded] == [(1, 0), (1, 1), (1, 2), (1, 0)]
 
 
 @pytest.mark.parametrize("form", WRITERS)
@@ -141,3 +169,12 @@ def test_a_worker_of_a_cluster_tells_the_client(tmp_path):
         assert client.scheduler_info(n_workers=-1)["workers"]
     assert np.isnan(found[1, CHUNK:]).all()
     assert not np.isnan(found[1, :CHUNK]).any()
+
+
+def test_what_stands_behind_a_chunk_that_is_cut_short_is_not_read():
+    """Blosc trusts its header; here it would find the rest of the bytes just behind the end."""
+    packed = Blosc("lz4").encode(np.random.default_rng(1).integers(0, 9, 10_000))
+    codecs = layout_module.zarr_codecs({"compressor": Blosc("lz4").get_config(), "filters": None})
+    assert layout_module.decoded_chunk(packed, codecs, np.dtype("i8")).size == 10_000
+    with pytest.raises(RuntimeError, match="it is cut short"):
+        layout_module.decoded_chunk(memoryview(packed)[:-1], codecs, np.dtype("i8"))

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from gyrostab.cli import commands
-from gyrostab.cli.console import complain, explain, plain_notes, read_config, stoppable
+from gyrostab.cli.console import complain, explain, plain_notes, read_config, seldom_collected, stoppable
 from gyrostab.cli.frame import app
 
 __all__ = ["app", "main"]
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in tokens
     try:
         app.config = read_config(tokens, [command for command in app if not command.startswith("-")])
-        with plain_notes(), stoppable():
+        with plain_notes(), stoppable(), seldom_collected():
             app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     except KeyboardInterrupt as stop:
         said = str(stop) or "interrupted; nothing was written under the name of the output. Start the same command again."

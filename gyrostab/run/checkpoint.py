@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gyrostab.export import CHUNK_VALUES
 from gyrostab.output import new_output
+from gyrostab.parts import with_part
 
 __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
 
@@ -79,10 +80,10 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     """
     arrays = {str(name): np.ascontiguousarray(variable.values) for name, variable in dataset.variables.items()}
     described, place = {}, 0
-    for name, values in arrays.items():
-        attrs = _to_json(dataset[name].attrs)
+    for (name, values), variable in zip(arrays.items(), dataset.variables.values(), strict=True):
         described[name] = {
-            "dims": list(dataset[name].dims), "dtype": values.dtype.str, "shape": list(values.shape), "place": place, "attrs": attrs,
+            "dims": list(variable.dims), "dtype": values.dtype.str, "shape": list(values.shape), "place": place,
+            "attrs": _to_json(variable.attrs),
         }  # fmt: skip
         place += -(-values.nbytes // _ALIGN) * _ALIGN
     header = {
@@ -204,27 +205,49 @@ def _lazily(blocks: Sequence[Block], name: str) -> Any:
     import dask.array as da
 
     described = blocks[0].header["variables"][name]
-    along = described["dims"].index("time")
+    along, dtype = described["dims"].index("time"), np.dtype(described["dtype"])
     edges = np.cumsum([0, *(block.part.stop - block.part.start for block in blocks)])
     shape = [int(edges[-1]) if i == along else size for i, size in enumerate(described["shape"])]
     dims = list(zip(described["dims"], shape, strict=True))
     inner = int(np.prod([size for dim, size in dims if dim not in ("axis", "term", "time")]))
     sizes = {"axis": 1, "term": 1, "time": max(1, min(shape[along], CHUNK_VALUES // max(1, inner)))}
 
-    def read(block_info: Mapping[Any, Any]) -> NDArray[Any]:
-        location = block_info[None]["array-location"]
-        begin, end = location[along]
-        pieces = []
+    def part(place: tuple[slice, ...]) -> NDArray[Any]:
+        begin, end = place[along].start, place[along].stop
+        values = np.empty([one.stop - one.start for one in place], dtype)
         for i in range(int(np.searchsorted(edges, begin, side="right")) - 1, int(np.searchsorted(edges, end, side="left"))):
-            where = [slice(*ends) for ends in location]
-            where[along] = slice(max(0, begin - int(edges[i])), min(end, int(edges[i + 1])) - int(edges[i]))
-            pieces.append(np.array(_section(blocks[i], name)[tuple(where)]))
-        return np.concatenate(pieces, axis=along)
+            first, last = max(begin, int(edges[i])), min(end, int(edges[i + 1]))
+            inside = [slice(first - int(edges[i]), last - int(edges[i])) if n == along else one for n, one in enumerate(place)]
+            _read_into(values[(slice(None),) * along + (slice(first - begin, last - begin),)], blocks[i], name, inside)
+        return values
+
+    def read(block_info: Mapping[Any, Any]) -> NDArray[Any]:
+        return part(tuple(slice(*ends) for ends in block_info[None]["array-location"]))
 
     chunks = da.core.normalize_chunks([sizes.get(dim, size) for dim, size in dims], shape=tuple(shape))
-    dtype = np.dtype(described["dtype"])
     label = f"{blocks[0].header['job']}-{name}"  # without it dask would hash all that `read` knows
-    return da.map_blocks(read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label)
+    return with_part(da.map_blocks(read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label), part)
+
+
+def _read_into(out: NDArray[Any], block: Block, name: str, place: Sequence[slice]) -> None:
+    """Part of a variable of a block, read at once where it lies in one piece: mapping a file anew costs more than it is long."""
+    shape = block.header["variables"][name]["shape"]
+    inner = max((i for i, size in enumerate(shape) if out.shape[i] < size), default=0)  # from the dimension after on, all is wanted
+    if out.flags.c_contiguous and out.size and all(size == 1 for size in out.shape[:inner]):
+        first = int(np.ravel_multi_index([one.start for one in place], shape)) * out.itemsize
+        with block.path.open("rb", buffering=0) as file:
+            file.seek(block.begin + block.header["variables"][name]["place"] + first)
+            if _fill(file, out.reshape(-1).view(np.uint8).data):
+                return
+        raise OSError(f"{block.path}: is cut short")
+    out[...] = _section(block, name)[tuple(place)]
+
+
+def _fill(file: Any, view: memoryview) -> bool:
+    """Read until a piece of memory is full; False when the file ends before."""
+    while view.nbytes and (count := file.readinto(view)):
+        view = view[count:]
+    return not view.nbytes
 
 
 def _to_json(attrs: Mapping[Any, Any]) -> dict[str, Any]:

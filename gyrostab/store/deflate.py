@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.parts import read_part
 from gyrostab.store.lock import library_lock
 from gyrostab.store.write import Progress
 from gyrostab.threads import in_order
@@ -67,10 +67,11 @@ def append_deflated(
     pieces = _pieces(large, encoding)
     with lock:
         target = h5py.File(path, "r+")
+        chunked = {name: target[name].id for name in large}
     try:
         for name, begin, size, packed in in_order(partial(_pack, large, encoding), pieces):
             with lock:
-                target[name].id.write_direct_chunk(begin, packed)
+                chunked[name].write_direct_chunk(begin, packed)
             done += size
             if progress is not None:
                 progress(done / total)
@@ -94,9 +95,9 @@ def _pack(
 ) -> tuple[str, tuple[int, ...], int, bytes]:
     """A chunk as it stands in the file, with its name, place and number of values."""
     name, begin = piece
-    options, data = encoding[name], large[name].data
-    part = data[tuple(slice(first, first + step) for first, step in zip(begin, options["chunksizes"], strict=True))]
-    values: NDArray[Any] = part if isinstance(part, np.ndarray) else part.compute(scheduler="synchronous")
+    options = encoding[name]
+    place = tuple(slice(first, first + step) for first, step in zip(begin, options["chunksizes"], strict=True))
+    values = read_part(large[name].data, place)
     fill = options["_FillValue"]
     chunk = np.full(options["chunksizes"], 0 if fill is None else fill, values.dtype)
     inside = chunk[tuple(map(slice, values.shape))]

@@ -6,6 +6,7 @@ import sys
 import threading
 import uuid
 import warnings
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -25,8 +26,8 @@ from gyrostab.timegrid import grid_times
 
 __all__ = ["open_stored"]
 
-#: Samples of the largest chunk that is kept when only a part of it was wanted.
-_KEPT_SAMPLES = 2**20
+#: Bytes of the chunks together that are kept when only a part of each was wanted.
+_KEPT_BYTES = 2**24
 
 
 def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
@@ -196,8 +197,11 @@ class _Chunks:
     def _stored(self, row: int, number: int, *, whole: bool) -> NDArray[Any]:
         """One chunk as it lies on disk; the last of a row has room for more than there is. One that is not wanted `whole` is kept."""
         place = (number,) if self.ndim == 1 else (row, number)
-        read = read_chunk if whole or self.length > _KEPT_SAMPLES else _kept_chunk
-        chunk = read(self.path, self.name, place, zarr=self.zarr, opened=self.opened)
+        chunk = _KEPT.find((self.opened, self.name, place))
+        if chunk is None:
+            chunk = read_chunk(self.path, self.name, place, zarr=self.zarr, opened=self.opened)
+            if not whole:
+                _KEPT.keep((self.opened, self.name, place), chunk)
         if chunk.size != self.length:
             raise ChunkDamage(f"is damaged: it holds {chunk.size} values in place of {self.length}")
         return chunk
@@ -218,8 +222,33 @@ class _Chunks:
             _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
 
 
-#: Chunks of which only a part was wanted: where one part of a run ends, another begins.
-_kept_chunk = lru_cache(maxsize=16)(read_chunk)
+class _Kept:
+    """Chunks by opening, variable and place, the latest of them, in memory that is bounded."""
+
+    def __init__(self, most: int):
+        self._most = most
+        self._held = 0
+        self._chunks: OrderedDict[tuple[Any, ...], NDArray[Any]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def find(self, key: tuple[Any, ...]) -> NDArray[Any] | None:
+        with self._lock:
+            if key in self._chunks:
+                self._chunks.move_to_end(key)
+            return self._chunks.get(key)
+
+    def keep(self, key: tuple[Any, ...], chunk: NDArray[Any]) -> None:
+        with self._lock:
+            if key in self._chunks or chunk.nbytes > self._most // 2:
+                return
+            self._chunks[key] = chunk
+            self._held += chunk.nbytes
+            while self._held > self._most:
+                self._held -= self._chunks.popitem(last=False)[1].nbytes
+
+
+#: Where one part of a run ends, another begins.
+_KEPT = _Kept(_KEPT_BYTES)
 
 _TELLING = threading.Lock()
 
