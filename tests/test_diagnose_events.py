@@ -158,7 +158,7 @@ def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) 
 
 @pytest.mark.parametrize(("late", "named"), [(0.0, ["vibration_rectification"]), (0.7, [])])
 def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(late: float, named: list[str]) -> None:
-    """A bias swings as the square of the vibration does, or a ninth of a period before it: then half of all other times would do as well."""
+    """A bias swings as the square of the vibration does, or a ninth of a period before it: then half of all other times do as well."""
     phase = 2.0 * np.pi * SECOND / 200.0
     rate = WHITE * np.random.default_rng(9).standard_normal((1, SECOND.size)) + 0.3 * np.sin(phase)
     shaking = np.sqrt(2.0 + np.sin(phase - late))
