@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from gyrostab.concealed import salt
 from gyrostab.concealed.limits import NATS, mean_size, shared_size, variance_size
-from gyrostab.concealed.measured import line_density, own_noise
+from gyrostab.concealed.measured import _slope, line_density, own_noise
 from gyrostab.concealed.record import make_log
 from gyrostab.concealed.salt import rough_noise
 from gyrostab.concealed.world import draw_world
@@ -70,6 +70,21 @@ def test_slow_noise_counts_at_its_slowest_lines():
     found = np.mean([line_density(np.cumsum(row), rate=1.0)[:4] for row in steps], axis=0)
     k = np.arange(1, 5)
     np.testing.assert_allclose(found, 0.01**2 / (2 * math.pi * k / 8000) ** 2, rtol=0.5)
+
+
+@pytest.mark.parametrize("loud", [1.0, 1e2, 1e4])
+def test_the_slope_is_the_most_likely_one_also_beside_a_loud_line(loud):
+    """No white noise, flicker and random walk of a fine grid suit the lines better."""
+    rng = np.random.default_rng(2)
+    number = np.arange(1.0, 61.0)
+    sizes = np.stack(np.meshgrid(*[np.exp(np.linspace(-12.0, 12.0, 33))] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    tried = sizes @ np.stack([number**0, 1.0 / number, number**-2])
+    for truth in np.exp(rng.normal(0.0, 3.0, (8, 3))):
+        lines = (truth[0] + truth[1] / number + truth[2] / number**2) * rng.exponential(size=60)
+        lines[rng.integers(60)] *= loud
+        found = _slope(lines)(number)
+        mine, others = ((np.log(density) + lines / density).sum(axis=-1) for density in (found, tried))
+        assert mine < others.min() + 1e-6
 
 
 def test_a_level_that_wanders_by_itself_hides_the_slow_change_and_not_the_quick_one():

@@ -106,6 +106,17 @@ def test_what_comes_back_to_the_same_level_is_an_event(back: float, jump: bool) 
     assert bool(possible(found, state)) == jump
 
 
+@pytest.mark.parametrize(("back", "jump"), [(1.0, False), (0.0, True)])
+def test_a_slight_event_that_lasts_long_is_no_jump(back: float, jump: bool) -> None:
+    """Two errors of a mean, for a twelfth of two hours: too little to be louder means."""
+    second = np.arange(360 * LENGTH) / RATE
+    course = 0.12 * ((second >= 3000.0) - back * (second >= 3640.0))
+    state = started(WHITE * np.random.default_rng(5).standard_normal((1, second.size)) + course)
+    found = parts_of(state, candidate(state, "bias_jump", "mean"))
+    assert gain_sum(found) > 8.0
+    assert bool(possible(found, state)) == jump
+
+
 @pytest.mark.parametrize("moves", [False, True])
 def test_only_motion_leaks(moves: bool) -> None:
     """Noise and a line that both axes have in common, with and without a sway of y that comes and goes and leaks into x."""
@@ -121,6 +132,18 @@ def test_only_motion_leaks(moves: bool) -> None:
     assert moves or float(found.gain.max()) < 3.0
 
 
+@pytest.mark.parametrize("sway", [0.0, 3.0])
+def test_what_is_at_rest_cannot_leak(sway: float) -> None:
+    """Whatever chance makes a leak of it gain."""
+    rng = np.random.default_rng(6)
+    rate = WHITE * rng.standard_normal((2, SECOND.size))
+    rate[1] += sway * WHITE * np.sin(2.0 * np.pi * 1.7 * SECOND)
+    state = started(rate)
+    one = next(each for each in effect_candidates(state.reduced, state.baseline["coefficient"])[0] if each.key == "misalignment(y)")
+    part = Part(one, one.variants[0], ("x",), 20.0)
+    assert possible([part], state) == ([part] if sway else [])
+
+
 @pytest.mark.parametrize("leak", [0.0, 0.003])
 def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) -> None:
     rng = np.random.default_rng(8)
@@ -131,6 +154,17 @@ def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) 
     beats, p_value = beats_slides([Part(one, variant, ("x",), 20.0)], state, fold_blocks(state.reduced))
     assert np.isfinite(p_value)
     assert beats == bool(leak)
+
+
+@pytest.mark.parametrize(("late", "named"), [(0.0, ["vibration_rectification"]), (0.7, [])])
+def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(late: float, named: list[str]) -> None:
+    """A bias swings as the square of the vibration does, or a ninth of a period before it: then half of all other times do as well."""
+    phase = 2.0 * np.pi * SECOND / 200.0
+    rate = WHITE * np.random.default_rng(9).standard_normal((1, SECOND.size)) + 0.3 * np.sin(phase)
+    shaking = np.sqrt(2.0 + np.sin(phase - late))
+    reduced = reduce_log(make_log(rate, rate=RATE, unit="deg/h", channels={"vibration": (shaking, "g")}), block=20.0)
+    found = name_effects(reduced, *nulls(reduced, 40))
+    assert [claim.effect for claim in found.claims] == named
 
 
 def swelling(size: float) -> State:

@@ -14,10 +14,14 @@ from gyrostab.diagnose.effects.explained import Part, take_parts
 from gyrostab.diagnose.effects.search import Found
 from gyrostab.diagnose.gains.levels import HOPS, level_courses, level_gains
 from gyrostab.diagnose.modelling.level_sizes import level_sizes
-from gyrostab.diagnose.naming.claims import Claim
+from gyrostab.diagnose.naming.claims import Claim, Naming
 from gyrostab.diagnose.naming.hopping import followed_first, hops_alone
+from gyrostab.diagnose.naming.name import name_effects
 from gyrostab.diagnose.naming.structure import possible
+from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.log import make_log
 from gyrostab.simulate import simulate
+from tests.named import nulls
 
 BLOCKS, STEP, WHITE = 100, 20.0, 0.01
 WALKS, FLICKERS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0]), np.array([0.0, 0.05, 0.2])
@@ -226,6 +230,31 @@ def test_jumps_that_are_hops_themselves_are_none(size: float, places: tuple[int,
     assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
     assert [one.variant.values["at"] for one in left[0].parts if one.candidate.effect == "bias_jump"] == [place * STEP for place in kept]
     assert np.abs(np.corrcoef(left[-1].parts[0].variant.design[0, 0], course)[0, 1]) > 0.98
+
+
+def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Naming:
+    """What a bias that switches between two levels, for so many blocks each, is named, beside a supply that does so with a scatter [V]."""
+    course = np.repeat(np.arange(len(stays)) % 2, stays).astype(float)
+    rng = np.random.default_rng(seed)
+    supply, noise = 24.0 + course + scatter * rng.standard_normal(course.size), rng.standard_normal(200 * course.size)
+    log = make_log(
+        np.repeat(step * course, 200) + noise, rate=10.0, unit="deg/h", channels={"supply_voltage": (np.repeat(supply, 200), "V")}
+    )
+    reduced = reduce_log(log, block=20.0)
+    return name_effects(reduced, *nulls(reduced, 40))
+
+
+def test_the_search_asks_hops_whether_jumps_named_before_are_theirs(one_thread) -> None:
+    """The supply that scatters holds the hops back; so the last of them is a jump first, and the search ends without it."""
+    naming = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
+    assert [claim.effect for claim in naming.claims] == ["telegraph"]
+    assert naming.verdict == "explained"
+
+
+def test_the_search_names_the_channel_that_switches_before_the_hops(one_thread) -> None:
+    """Two levels bring more than a supply that is known with a scatter, and still it is the cause."""
+    naming = switched([45, 14, 3, 12, 3, 10, 3, 5], 1, step=0.6, scatter=0.3)
+    assert [claim.effect for claim in naming.claims] == ["supply_bias"]
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from gyrostab.diagnose.calibration.baseline import calibrate
+from gyrostab.diagnose.effects.candidates import effect_candidates
+from gyrostab.diagnose.effects.cells import begin_state
 from gyrostab.diagnose.effects.designs import Candidate, Variant
-from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.effects.explained import Part, explain_away
 from gyrostab.diagnose.effects.response import straightened
+from gyrostab.diagnose.effects.search import gains, of_means
+from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.gains.lines import line_gains, line_skirt
 from gyrostab.diagnose.naming.claims import Claim, form_error, with_claim
 from gyrostab.diagnose.naming.name import name_effects
 from gyrostab.diagnose.naming.odd import line_size
-from gyrostab.diagnose.naming.parts import without_lines
+from gyrostab.diagnose.naming.parts import by_key, without_lines
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.log import make_log
 from tests.named import nulls
@@ -89,6 +94,24 @@ def test_each_line_is_a_claim_of_its_own(lines: tuple[Claim, ...]) -> None:
     assert all(len({part.place for part in claim.parts}) == 1 for claim in lines)
     assert len({claim.parts[0].place for claim in lines}) == 3
     assert all({"real_motion", "supply_bias", "feedback_reset"} <= set(claim.alternatives) for claim in lines)  # three may be a comb
+
+
+def test_a_line_changes_no_gain_of_the_means() -> None:
+    reduced = sines({0.7: 0.4}, size=9_000, axes=1)
+    state, folds = begin_state(reduced, calibrate(reduced)), fold_blocks(reduced)
+    candidates, _ = effect_candidates(reduced, state.baseline["coefficient"])
+    found = gains(candidates, reduced, state, folds)
+    line, jump = (by_key(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
+    assert line.gain > 10.0
+    named = explain_away(state, [line])
+    kept = of_means(found, state, named)
+    assert {one.candidate.view for one in kept} == {"mean", "levels"}
+    again = gains([one.candidate for one in kept], named.reduced, named, folds)
+    for one, other in zip(kept, again, strict=True):
+        np.testing.assert_array_equal(one.gain, other.gain)
+    assert not of_means(found, state, explain_away(state, [jump]))
+    lost = replace(state, reduced=reduced.assign(mean=reduced["mean"].where(reduced["begin"] > 0.0)))
+    assert not of_means(found, state, lost)
 
 
 # ------------------------------------------------------------------------------------------------------------ bookkeeping

@@ -17,7 +17,9 @@ from gyrostab.diagnose.gains.tallies import count_gains, expected_counts
 from gyrostab.diagnose.naming.name import Claim, name_effects, tail_level
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.diagnose.naming.surrogates import beats_slides
+from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError
+from gyrostab.log import make_log
 from tests.named import WORLD, nulls, record
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -186,11 +188,11 @@ def test_blocks_that_are_lost_are_expected_to_count_nothing():
 
 def test_every_line_of_a_comb_is_named():
     """More lines than other effects are looked for."""
-    quiet = record([])
+    quiet = reduce_log(make_log(np.random.default_rng(3).standard_normal((2, 24_000)), rate=10.0, unit="deg/h"))
     comb = np.arange(5, quiet.sizes["line"], 7)
     loud = np.ones(quiet.sizes["line"])
     loud[comb] = 4.0
-    shape = xr.DataArray(np.stack([loud, np.ones_like(loud), np.ones_like(loud)]), dims=("axis", "line"))
+    shape = xr.DataArray(np.stack([loud, np.ones_like(loud)]), dims=("axis", "line"))
     reduced = quiet.assign(line_power=(quiet["line_power"] * shape).transpose(*quiet["line_power"].dims))
     baseline, chance = nulls(quiet, 40)
     found = name_effects(reduced, baseline, chance)

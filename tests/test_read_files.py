@@ -245,8 +245,18 @@ def test_a_log_of_gyrostab_comes_back_lazily_on_its_exact_grid(tmp_path: Path, n
     assert back.temperature.dims == ("time_temperature",)
     summary = scan_file(path)
     assert (summary.format, summary.axes, summary.n_rows) == ("gyrostab log", ("x", "z"), 5000)
-    assert summary.channels == ("vibration", "temperature")
+    assert summary.channels == (("vibration", "temperature") if path.suffix == ".nc" else ("temperature", "vibration"))
     assert (summary.first, summary.last) == (log.time.values[0], log.time.values[-1])
+
+
+@pytest.mark.filterwarnings("ignore:.*does not have a Zarr V3 specification.*")
+def test_channels_of_a_zarr_store_come_in_the_order_of_their_names(tmp_path: Path) -> None:
+    """Its directory keeps no order."""
+    names = [f"channel_{letter}" for letter in "gbhdafce"]
+    log = regular_log(100)
+    path = store(log.assign({name: ("time", log.vibration.values, {"units": "g"}) for name in names}), tmp_path / "log.zarr")
+    assert scan_file(path).channels == (*sorted(names), "temperature", "vibration")
+    assert list(read_log(path).data_vars) == [*sorted(names), "rate", "temperature", "vibration"]
 
 
 @pytest.mark.parametrize("name", ["log.nc", "log.zarr"])

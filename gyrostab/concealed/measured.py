@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, signal, special
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import minimize
+from scipy.optimize import nnls
 
 __all__ = ["BANDS", "OwnNoise", "line_density", "own_noise"]
 
@@ -26,6 +26,10 @@ BANDS = 24
 _SAMPLES = 6 * BANDS  # of a block, at least
 _WIDE = 33  # lines that are averaged
 _LOW = 128  # lines that the slope of the slow noise is fitted to
+#: White, flicker and random walk from which the fit of the slope starts, times the level: one loud line can make more than one best fit.
+_STARTS = ((1.0, 1e-2, 1e-2), (1.0, 10.0, 1e-2), (1.0, 1e-2, 100.0), (1e-2, 10.0, 1e-2), (1e-2, 1e-2, 100.0))
+_ROUNDS, _ENOUGH = 100, 1e-9  # of the fit of the slope, at most; and nats that a round brings at least
+_STEPS = 0.5 ** np.arange(20.0)
 _LOST = 0.5  # of two blocks, at most
 _LINES = 1.94  # neighbouring lines whose powers say as much as one, behind a Hann window
 
@@ -101,20 +105,44 @@ def line_density(values: Array, *, rate: float) -> Array:
 
 def _slope(lines: Array) -> Callable[[Array], Array]:
     """White, flicker and random walk, as a function of the number of the line, that suit the first lines best (Whittle's likelihood)."""
-    number = np.arange(1.0, lines.size + 1)
     level = float(np.median(lines)) / math.log(2.0) + 1e-300
+    power, shapes = lines / level, _shapes(np.arange(1.0, lines.size + 1))
+    found = [_suited(power, shapes, np.array(start)) for start in _STARTS]
+    best = min(found, key=lambda size: _misfit(power, shapes @ size))
+    return lambda k: level * (_shapes(k) @ best)
 
-    def density(logarithms: Array, k: Array) -> Array:
-        white, flicker, walk = np.exp(np.clip(logarithms, -30, 60))
-        return np.asarray(level * (white + flicker / k + walk / k**2))
 
-    def misfit(logarithms: Array) -> float:
-        expected = density(logarithms, number)
-        return float((np.log(expected) + lines / expected).sum())
+def _suited(power: Array, shapes: Array, size: Array) -> Array:
+    """Sizes of terms, none below zero, that suit powers best as seen from a start.
 
-    starts = [(0.0, -5.0, -5.0), (0.0, 2.0, -5.0), (0.0, -5.0, 5.0)]
-    best = min((minimize(misfit, start, method="Nelder-Mead", options={"maxiter": 400}) for start in starts), key=lambda one: one.fun)
-    return lambda k: density(best.x, k)
+    By Fisher scoring: least squares with the weights of the density found before, and a shorter step where the whole one is no better.
+    """
+    density = shapes @ size
+    misfit = _misfit(power, density)
+    for _ in range(_ROUNDS):
+        way = nnls(shapes / density[:, None], power / density)[0] - size
+        before = misfit
+        for step in _STEPS:
+            density = shapes @ (size + step * way)
+            misfit = _misfit(power, density)
+            if misfit < before:
+                break
+        else:
+            return size
+        size = size + step * way
+        if before - misfit < _ENOUGH:
+            break
+    return size
+
+
+def _shapes(number: Array) -> Array:
+    """White, flicker and random walk (line, term) at lines of these numbers."""
+    return np.asarray(number[:, None] ** -np.arange(3.0))
+
+
+def _misfit(power: Array, density: Array) -> float:
+    """Minus the logarithm of Whittle's likelihood."""
+    return float((np.log(density) + power / density).sum())
 
 
 def _block_powers(values: Array, *, rate: float, block: int) -> Array:

@@ -100,6 +100,8 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
             raise FormatError(f"{path.name}: this Zarr store is no gyrostab log (axis and time, attribute sampling_rate_hz)")
         return None
     log = xr.decode_cf(stored)
+    if path.is_dir():
+        log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
     log.set_close(stored.close)
     try:
         for name in log.variables:

@@ -26,9 +26,10 @@ from gyrostab.diagnose.gains.tallies import (
     kurtosis_gains,
 )
 
-__all__ = ["Found", "Tallies", "gains", "hops_within", "together", "totals"]
+__all__ = ["Found", "Tallies", "gains", "hops_within", "of_means", "together", "totals"]
 
 Array = NDArray[np.float64]
+_OF_MEANS, _TAILS = ("mean", "levels"), ("kurtosis", "outliers")  # views of means; what the means do not hear of
 _PRICE = 1.5  # nats that another axis or view must bring
 _WITHIN = 2.0  # blocks that a bias stays on a level at most, where pieces of blocks know it better
 _LONG = 3.0  # the same, where they can refute it
@@ -128,6 +129,21 @@ def gains(
         elif view != "wander":
             found += _cells(group, data, state, folds, rng)
     return found
+
+
+def of_means(found: Sequence[Found], before: State, now: State) -> list[Found]:
+    """Those gains by means of blocks and of their pieces that still hold in another state; none where it knows more of the means.
+
+    A line, say, changes nothing in them.
+    """
+    if before.baseline is not now.baseline or _of_means_given(before) != _of_means_given(now):
+        return []
+    left, right = (state.reduced.drop_vars(_TAILS, errors="ignore") for state in (before, now))
+    return [one for one in found if one.candidate.view in _OF_MEANS] if left.equals(right) else []
+
+
+def _of_means_given(state: State) -> dict[tuple[str, str], list[int]]:
+    return {key: [id(column) for column in columns] for key, columns in state.given.items() if key[0] in ("mean", "inner") and columns}
 
 
 def totals(found: Sequence[Found]) -> dict[str, Array]:

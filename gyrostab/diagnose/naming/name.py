@@ -15,7 +15,7 @@ from gyrostab.diagnose.effects.candidates import Candidate, effect_candidates
 from gyrostab.diagnose.effects.cells import State, begin_state
 from gyrostab.diagnose.effects.explained import Part, explain_away, reweighted, take_parts
 from gyrostab.diagnose.effects.generics import generic_candidates
-from gyrostab.diagnose.effects.search import Found, Tallies, gains, totals
+from gyrostab.diagnose.effects.search import Found, Tallies, gains, of_means, totals
 from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.gains.tallies import Expected
 from gyrostab.diagnose.naming.claims import Claim, Naming, Unknown, form_error, unknown_of, with_axes_of, with_claim
@@ -163,8 +163,10 @@ class _Search:
         state = start
         barred = {key for one in self.expected for key in (one.parts[0].candidate.key, *self._counted(one))}
         rounds, lines = _ROUNDS, _LINES
+        found: list[Found] = []
+        before = start
         while rounds and lines:
-            found = self._ranked(state, barred)
+            found, before = self._ranked(state, barred, of_means(found, before, state)), state
             pick = self._pick(found, state, chosen)
             if pick is None:
                 break
@@ -196,15 +198,17 @@ class _Search:
         marks |= _OF_ZEROS if marks & _OF_ZEROS else set()
         return {other.key for other in self.candidates if other.view == "marks" and marks & set(other.marks)}
 
-    def _gains(self, state: State) -> list[Found]:
-        return self._of(self.candidates, state)
-
     def _of(self, candidates: Sequence[Candidate], state: State) -> list[Found]:
         return gains(candidates, state.reduced, state, self.folds, tallies=self.tallies)
 
-    def _ranked(self, state: State, barred: set[str]) -> list[Found]:
-        """Gains of all that is not barred, with weights that suit the best in the powers: what is loud is loud in every view."""
-        found = [one for one in self._gains(state) if one.candidate.key not in barred]
+    def _ranked(self, state: State, barred: set[str], known: Sequence[Found] = ()) -> list[Found]:
+        """Gains of all that is not barred, with weights that suit the best in the powers: what is loud is loud in every view.
+
+        Those that are known are not sought again.
+        """
+        there = {id(one.candidate) for one in known}
+        sought = [one for one in self.candidates if one.key not in barred and id(one) not in there]
+        found = [*(one for one in known if one.candidate.key not in barred), *self._of(sought, state)]
         weighed = [one.candidate for one in found if one.candidate.view in _WEIGHED]
         for _ in range(2):
             powers = [one for one in found if one.candidate.view == "power"]
