@@ -313,6 +313,19 @@ class TestGaps:
         # white noise is seen too high, by exactly what the mask says
         assert float(result.white_response.sel(tau=1.0)) == pytest.approx(1.25, abs=0.02)
 
+    def test_a_bridged_window_is_the_same_alone(self):
+        x = np.random.default_rng(6).standard_normal(30_000) + 3.0
+        x[5000:5800] = x[20_000:20_700] = np.nan
+        ks = np.array([1, 30, 200, 300])
+        unit = Unit(1000, 300, ks, np.zeros_like(ks), False, 0.01, False, 0.3, 0.1)
+        cells, _ = surface_unit(x, unit)
+        bridged = np.flatnonzero((cells[4] == WEIGHTED).any(axis=1))
+        assert bridged.size >= 8
+        assert np.diff(bridged).max() > 20
+        for j in bridged:
+            alone, _ = surface_unit(x[j * 300 : j * 300 + 1000], unit)
+            np.testing.assert_allclose(cells[:, j], alone[:, 0], rtol=1e-9)
+
     @pytest.mark.parametrize("block", [5, 60])
     def test_responses_predict_what_gaps_do_to_white_and_quantization_noise(self, block):
         rng = np.random.default_rng(13)

@@ -177,12 +177,14 @@ def _rate_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tup
 
 
 def _angle_of(x: NDArray[np.generic], present: _Present, windows: Integers, unit: Unit, space: Workspace) -> Floats:
-    """Angle of all samples, (n + 1,), that has its values from the first of some windows to the block behind the last of them."""
-    first, last = windows[0] * unit.step, min((windows[-1] + 1) * unit.step + unit.window, x.size)
+    """Angle of all samples, (n + 1,), in some windows and the block behind each of them; each stretch of windows begins at zero."""
     angle = space.array("angle", x.size + 1)
-    starts, stops = (np.clip(edges, first, last) - first for edges in present[:2])
-    some = starts < stops
-    integrate(x[first:last], present.offset, starts[some], stops[some], angle[first : last + 1])
+    begins, ends = windows * unit.step, np.minimum((windows + 1) * unit.step + unit.window, x.size)
+    apart = np.flatnonzero(begins[1:] > ends[:-1])
+    for first, last in zip(begins[np.r_[0, apart + 1]], ends[np.r_[apart, -1]], strict=True):
+        starts, stops = (np.clip(edges, first, last) - first for edges in present[:2])
+        some = starts < stops
+        integrate(x[first:last], present.offset, starts[some], stops[some], angle[first : last + 1])
     return angle
 
 
