@@ -5,8 +5,8 @@
 Prints a Markdown table, and puts it into its place in a page. Every figure is the best of some runs, each in a process of its own that
 is warm: kernels compiled, files in the cache of the system. Beside the time on the clock stands the processor time of all threads,
 which says more where the machine has other work to do. A run uses every second difference (``full``, as by default) or those that
-``--overlap octave`` leaves. Reading is every sample as a double in memory, chunk by chunk, through
-dask (for CSV: a table of pyarrow).
+``--overlap octave`` leaves. The peer reads every sample as a double into memory: xarray, one file after the other in as many threads as
+there are workers, or for CSV pyarrow, as a table. Beside it stands the same by gyrostab's own reader, chunk by chunk through dask.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -43,17 +44,23 @@ def main() -> None:
     if options.measure:
         what, workers, folder = options.measure
         files = sorted(Path(folder).glob("log-*"))
-        works = {"read": read_dask, "parse": read_arrow, "full": partial(run_whole, "full"), "octave": partial(run_whole, "octave")}
+        works = {
+            "xarray": read_xarray,
+            "own": read_own,
+            "pyarrow": read_arrow,
+            "full": partial(run_whole, "full"),
+            "octave": partial(run_whole, "octave"),
+        }
         print(json.dumps(works[what](files, int(workers), options.repeat)))
         return
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as root:
         rows = [row for form in options.formats for row in compare(form, Path(root, form), options)]
     head = (
-        "| archive | hours | workers | terms | read [s] | Msamples/s | whole run [s] | Msamples/s | run / read | target "
-        "| processor: read [s] | run [s] | run / read |"
+        "| archive | hours | workers | terms | peer reads [s] | own reader [s] | whole run [s] | Msamples/s | run / peer | target "
+        "| run / own reader | processor: peer [s] | own reader [s] | run [s] | run / peer |"
     )
     said = f"{machine()}; {options.rate:g} Hz, 3 axes, files of one hour with gaps; best of {options.repeat}."
-    text = "\n".join([f"{said}\n", head, "|" + "---|" * 13, *rows])
+    text = "\n".join([f"{said}\n", head, "|" + "---|" * 15, *rows])
     print(text)
     if options.output:
         renew(options.output, "end to end", text)
@@ -66,14 +73,14 @@ def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
     samples = 3 * hours * 3600 * options.rate / 1e6
     rows = []
     for workers in options.workers:
-        read = measure("parse" if form == "csv" else "read", workers, folder, options)
+        peer = measure("pyarrow" if form == "csv" else "xarray", workers, folder, options)
+        own = None if form == "csv" else measure("own", workers, folder, options)
         for terms in ("full", "octave"):
-            clock, processor = zip(read, measure(terms, workers, folder, options), strict=True)
-            figures = " | ".join(
-                [f"{one:.2f} | {samples / one:.1f}" for one in clock] + [f"{clock[1] / clock[0]:.2f}", f"<= {TARGETS[form]:g}"]
-                + [f"{one:.2f}" for one in processor] + [f"{processor[1] / processor[0]:.2f}"]
-            )  # fmt: skip
-            rows.append(f"| {FORMATS[form]} | {hours:g} | {workers} | {terms} | {figures} |")
+            run = measure(terms, workers, folder, options)
+            clock, processor = ([f"{one[i]:.2f}" if one else "" for one in (peer, own, run)] for i in range(2))
+            ratios = [f"{run[0] / peer[0]:.2f}", f"<= {TARGETS[form]:g}", f"{run[0] / own[0]:.2f}" if own else ""]
+            cells = [FORMATS[form], f"{hours:g}", str(workers), terms, *clock, f"{samples / run[0]:.1f}", *ratios, *processor]
+            rows.append("| " + " | ".join([*cells, f"{run[1] / peer[1]:.2f}"]) + " |")
     return rows
 
 
@@ -98,8 +105,23 @@ def best(work: Callable[[], object], repeat: int) -> tuple[float, float]:
     return min(clock), min(processor)
 
 
-def read_dask(files: list[Path], workers: int, repeat: int) -> tuple[float, float]:
-    """Every chunk of every file as doubles."""
+def read_xarray(files: list[Path], workers: int, repeat: int) -> tuple[float, float]:
+    """Every file as doubles, by what xarray reads it with."""
+    import xarray as xr
+
+    def load(file: Path) -> None:
+        with xr.open_dataset(file, engine="zarr" if file.is_dir() else "netcdf4") as log:
+            log["rate"].load()
+
+    def work() -> None:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(load, files))
+
+    return best(work, repeat)
+
+
+def read_own(files: list[Path], workers: int, repeat: int) -> tuple[float, float]:
+    """Every chunk of every file as doubles, by gyrostab."""
     import dask
 
     from gyrostab.export import open_log
