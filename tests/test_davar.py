@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import allantools
 import dask
 import dask.array as da
@@ -11,15 +13,16 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.davar import davar
+from gyrostab.davar import davar, davar_part, davar_parts
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.blocks import held_points
 from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places, thin_pyramid
 from gyrostab.kernels.surface import Unit, surface_unit
 from gyrostab.kernels.vectors import IN_A_ROW, LANES, split_sums
-from gyrostab.kernels.workspace import Workspace
+from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.log import make_log
 from gyrostab.schema import ESTIMATORS
+from gyrostab.store.direct import held
 from gyrostab.windows import thin
 from tests.reference import direct_angle_surface, direct_surface
 
@@ -242,6 +245,25 @@ class TestInvariance:
             for name in ("avar", "count", "coverage", "edf", "estimator", "window_mean", "temperature", "temperature_rate"):
                 assert isinstance(lazy[name].data, da.Array), name
                 np.testing.assert_array_equal(lazy[name].values, whole[name].values, err_msg=name)
+
+    @pytest.mark.parametrize("dtype", [np.float64, np.float32])
+    def test_parts_that_share_memory_are_the_surface(self, dtype):
+        rows = np.random.default_rng(8).standard_normal((2, 400_000)).astype(dtype)
+        rows[1, 5000:9000] = np.nan
+        log = log_of(rows)
+        log = log.assign(rate=(log.rate.dims, held(rows, 30_000), log.rate.attrs))
+        options = {"window": 4000, "step": 1000, "taus": 20}
+        whole, space = davar(log, **options).load(), Workspace()
+        parts = [davar_part(log, part=part, space=space, **options) for part in davar_parts(log, samples=10_000, **options)]
+        assert len(parts) > 1
+        xr.testing.assert_identical(xr.concat(parts, "time", data_vars="minimal").avar, whole.avar)
+
+    def test_every_thread_has_a_workspace_of_its_own(self):
+        spaces = Workspaces()
+        with ThreadPoolExecutor(1) as pool:
+            others = [pool.submit(lambda: spaces.own).result() for _ in range(2)]
+        assert others[0] is others[1]
+        assert others[0] is not spaces.own
 
     def test_a_dask_log_is_not_computed(self):
         def forbidden(*_, **__):

@@ -91,9 +91,9 @@ def computed(monkeypatch) -> list[slice]:
     """The parts that are computed from now on."""
     parts: list[slice] = []
 
-    def counted(log, part, windows, fitting):
+    def counted(log, part, windows, fitting, space=None):
         parts.append(part)
-        return engine.compute_part(log, part, windows, fitting)
+        return engine.compute_part(log, part, windows, fitting, space)
 
     monkeypatch.setattr("gyrostab.run.core.compute_part", counted)
     return parts

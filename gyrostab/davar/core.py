@@ -168,7 +168,7 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
 
 
-def davar_part(log: xr.Dataset, *, part: slice, **options: Any) -> xr.Dataset:
+def davar_part(log: xr.Dataset, *, part: slice, space: Workspace | None = None, **options: Any) -> xr.Dataset:
     """Some windows of the surface that `davar` makes, computed at once and in the calling thread.
 
     Only the samples of these windows are read, and dask is not asked to compute anything beside that, so that many parts
@@ -180,6 +180,8 @@ def davar_part(log: xr.Dataset, *, part: slice, **options: Any) -> xr.Dataset:
         Regular log, numpy or dask.
     part : slice
         Windows, counted from the first window of the log: one of `davar_parts`, or any other without a step.
+    space : gyrostab.kernels.workspace.Workspace, optional
+        Memory to work in, for parts one after the other in one thread.
     **options
         Options of `davar`, with ``method="blocks"``.
 
@@ -207,27 +209,38 @@ def davar_part(log: xr.Dataset, *, part: slice, **options: Any) -> xr.Dataset:
     data, unit = plan.signal.data, plan.unit
     tables = _kept_tables(plan)
     units = [one for one in units_of_work(data.shape[1], unit) if one.start < part.stop and one.stop > part.start]
-    begin, end = units[0].start * unit.step, last_sample(units[-1], unit)
-    cells, means, space = [], [], Workspace()
-    for line in _rows(data, begin, end):
-        done = [_work(line[one.start * unit.step - begin : last_sample(one, unit) - begin], unit, tables, space) for one in units]
-        cells.append(np.concatenate([one[0] for one in done], axis=1))
-        means.append(np.concatenate([one[1] for one in done], axis=1))
+    spans = [(one.start * unit.step, last_sample(one, unit)) for one in units]
+    space = space or Workspace()
+    done = [_work(x, unit, tables, space) for x in _stretches(data, spans, space)]
+    rows = range(0, len(done), len(units))
+    cells, means = ([np.concatenate([one[i] for one in done[row : row + len(units)]], axis=1) for row in rows] for i in range(2))
     kept = slice(part.start - units[0].start, part.stop - units[0].start)
     return _label(np.stack(cells, axis=1)[:, :, kept], np.stack(means, axis=1)[:, :, kept], log, plan, part=part)
 
 
-def _rows(data: Any, begin: int, end: int) -> Iterator[NDArray[np.generic]]:
-    """The samples of each axis, one after the other; all are read together where they are few and dask must be asked."""
+def _stretches(data: Any, spans: Sequence[tuple[int, int]], space: Workspace) -> Iterator[NDArray[np.generic]]:
+    """The samples of each span, of one axis after the other; each is to be used before the next is asked for.
+
+    They are read span by span where that needs no dask; what two spans share is read once. Where dask must be asked, all axes are read
+    together if they are few.
+    """
+    begin, end = spans[0][0], spans[-1][1]
     if isinstance(data, da.Array) and can_fill(data):
-        line = np.empty(end - begin, data.dtype)
+        longest = max(last - first for first, last in spans)
+        line = space.array("samples", longest).view(data.dtype)[:longest]
         for row in range(data.shape[0]):
-            fill_row(data, row, begin, line)
-            yield line
+            held_from = held_to = begin
+            for first, last in spans:
+                shared = max(held_to - first, 0)
+                line[:shared] = line[first - held_from : held_to - held_from]
+                fill_row(data, row, first + shared, line[shared : last - first])
+                held_from, held_to = first, last
+                yield line[: last - first]
         return
     together = 1 if data.shape[0] * (end - begin) > _TOGETHER else data.shape[0]
     for row in range(0, data.shape[0], together):
-        yield from stretch(data[row : row + together], begin, end)
+        for whole in stretch(data[row : row + together], begin, end):
+            yield from (whole[first - begin : last - begin] for first, last in spans)
 
 
 def _work(

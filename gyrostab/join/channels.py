@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
@@ -118,6 +119,7 @@ def _own_time(holders: Sequence[Piece], name: str, start: int, rate: float) -> t
     if not done:
         return np.empty(0, dtype=np.int64), np.empty(0)
     stamps, places = (np.concatenate(column) for column in zip(*done, strict=True))
+    done.clear()  # of channels of many days a copy less
     return stamps, _taken(arrays, places)
 
 
@@ -137,9 +139,14 @@ def _taken(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
 
 def _parts(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[Part]:
     """The values at `places` as stretches of the arrays."""
-    begins = np.cumsum([0, *map(len, arrays)])
-    owner = np.searchsorted(begins, places, side="right") - 1
-    edges = np.flatnonzero((np.diff(places, prepend=-2, append=-2) != 1) | (np.diff(owner, prepend=-1, append=-1) != 0))
-    return [
-        (arrays[owner[a]], None, np.array([[a, places[a] - begins[owner[a]], b - a]], dtype=np.int64)) for a, b in pairwise(edges.tolist())
-    ]
+    begins = np.cumsum([0, *map(len, arrays)]).tolist()
+    edges = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
+    parts: list[Part] = []
+    for at, end in pairwise(edges):
+        while at < end:
+            place = int(places[at])
+            owner = bisect_right(begins, place) - 1
+            size = min(end - at, begins[owner + 1] - place)
+            parts.append((arrays[owner], None, np.array([[at, place - begins[owner], size]], dtype=np.int64)))
+            at += size
+    return parts

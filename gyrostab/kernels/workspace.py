@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import threading
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Workspace"]
+__all__ = ["Workspace", "Workspaces"]
 
 # Bytes of a line of the cache; vectors that begin with one are loaded at once.
 _LINE = 64
@@ -36,3 +37,10 @@ class Workspace:
             begin = -memory.ctypes.data % _LINE // 8
             self._kept[name] = memory[begin : begin + size]
         return self._kept[name][:size].reshape(shape)
+
+
+class Workspaces(threading.local):
+    """A `Workspace` for each thread that looks at ``own``."""
+
+    def __init__(self) -> None:
+        self.own = Workspace()

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
+from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
 from gyrostab.run.checkpoint import find_blocks
 from gyrostab.run.checks import check_output, check_windows
@@ -277,7 +278,7 @@ def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _
     def advance(count: int) -> None:
         stage("computing", total, total * sum(block.part.stop - block.part.start for block in blocks.values()) // parts[-1].stop)
 
-    call: tuple[Any, ...] = (_part_of_log, log, windows, fitting)
+    call: tuple[Any, ...] = (_part_of_log, log, Workspaces(), windows, fitting)
     if pool.remote and len(blocks) < len(parts):
         source = {**reading, "paths": _absolute(paths), "channel": _absolute(reading.get("channel", ()))}
         if not store.exists() and not any(map(_is_log, job.files)):  # some may be damaged; the two kinds do not mix
@@ -304,8 +305,10 @@ def _absolute(paths: Sequence[str | Path]) -> list[str]:
     return [os.path.abspath(path) for path in paths]
 
 
-def _part_of_log(log: xr.Dataset, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice) -> xr.Dataset:
-    return compute_part(log, part, windows, fitting)
+def _part_of_log(
+    log: xr.Dataset, spaces: Workspaces, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice
+) -> xr.Dataset:
+    return compute_part(log, part, windows, fitting, spaces.own)
 
 
 def _part_of_files(source: str, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice) -> xr.Dataset:

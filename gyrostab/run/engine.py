@@ -13,6 +13,7 @@ import xarray as xr
 from gyrostab.davar import davar_part
 from gyrostab.export import to_netcdf
 from gyrostab.fit import fit_part
+from gyrostab.kernels.workspace import Workspace
 from gyrostab.progress import Stage
 from gyrostab.run.checkpoint import Block, assemble, write_block
 from gyrostab.run.schedule import Pool, in_any_order
@@ -25,9 +26,11 @@ _HELD_SECONDS, _HELD_BYTES = 1.0, 2**26  # results wait so long at most until th
 _LOOKS = 50  # and no longer than so many of the looks take: what has been written need not be at the end
 
 
-def compute_part(log: xr.Dataset, part: slice, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None) -> xr.Dataset:
+def compute_part(
+    log: xr.Dataset, part: slice, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, space: Workspace | None = None
+) -> xr.Dataset:
     """Some windows of a product (or of a surface, where `fitting` is None), at once and in the calling thread."""
-    surface = davar_part(log, part=part, **windows)
+    surface = davar_part(log, part=part, space=space, **windows)
     if fitting is None:
         return surface
     return fit_part(surface, **fitting)
