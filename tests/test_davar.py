@@ -257,6 +257,8 @@ class TestInvariance:
         parts = [davar_part(log, part=part, space=space, **options) for part in davar_parts(log, samples=10_000, **options)]
         assert len(parts) > 1
         xr.testing.assert_identical(xr.concat(parts, "time", data_vars="minimal").avar, whole.avar)
+        units_together = davar_part(log, part=slice(0, whole.sizes["time"]), space=space, **options)
+        xr.testing.assert_identical(units_together.avar, whole.avar)
 
     def test_every_thread_has_a_workspace_of_its_own(self):
         spaces = Workspaces()
