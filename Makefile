@@ -37,7 +37,7 @@ lint: $(VENV)/.installed-lint  ## style, types and imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.md anew: an hour of an idle machine
+bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.md anew: twenty minutes of an idle machine
 	$(BIN)/python benchmarks/kernels.py --output docs/performance.md
 	$(BIN)/python benchmarks/fit.py --output docs/performance.md
 	$(BIN)/python benchmarks/end_to_end.py --output docs/performance.md

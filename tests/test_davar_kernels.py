@@ -1,0 +1,78 @@
+"""Kernels of the dynamic Allan variance one by one: the integral and its levels, several lags in one pass, memory that others have used."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places, thin_pyramid
+from gyrostab.kernels.surface import Unit, surface_unit
+from gyrostab.kernels.vectors import IN_A_ROW, LANES, split_sums
+from gyrostab.kernels.workspace import Workspace
+from gyrostab.windows import thin
+
+
+class TestKernels:
+    @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.booleans(), st.integers(1, 200))
+    @settings(max_examples=100, deadline=None)
+    def test_sums_of_several_lags_in_one_pass(self, seed, count, in_a_row, longest):
+        rng = np.random.default_rng(seed)
+        if in_a_row:
+            count = IN_A_ROW if count > 2 else 4
+        sizes, first, place = rng.integers(0, longest, count), int(rng.integers(0, 9)), int(rng.integers(0, 3))
+        lags = rng.integers(1, 40) + np.arange(-2, count) if in_a_row else np.sort(rng.choice(40, count + 2, replace=False)) + 1
+        splits = rng.integers(0, sizes + 1)
+        used = lags[2:]
+        theta = np.full(first + longest + 2 * used.max() + 2 * LANES, np.nan)  # what no term needs may be anything
+        end = first + (sizes + 2 * used).max()
+        theta[first:end] = rng.standard_normal(end - first)
+        heads, tails = np.full((2, count + 4), 7.0)
+        split_sums(theta, first, count, lags, 2, splits, sizes, heads, tails, place)
+        for i, (k, split, size) in enumerate(zip(used, splits, sizes, strict=True)):
+            m = first + np.arange(size)
+            squares = (theta[m + 2 * k] - 2 * theta[m + k] + theta[m]) ** 2
+            found = [heads[place + i] - 7.0, tails[place + i] - 7.0]
+            np.testing.assert_allclose(found, [squares[:split].sum(), squares[split:].sum()], rtol=1e-12, atol=1e-13)
+        others = np.r_[:place, place + count : count + 4]
+        assert np.all(heads[others] == 7.0)
+        assert np.all(tails[others] == 7.0)
+
+    @given(st.integers(0, 2**32 - 1), st.integers(1, 9000), st.sampled_from([0.0, 0.001, 0.3, 0.99, 1.0]))
+    @settings(max_examples=40, deadline=None)
+    def test_integral_and_its_levels(self, seed, n, missing):
+        rng = np.random.default_rng(seed)
+        x = rng.integers(-5, 6, n).astype(np.float64)
+        x[rng.random(n) < missing] = np.nan
+        step = int(rng.integers(1, n + 1))
+        known = np.array([float(np.isfinite(x[a : a + step]).sum()) for a in range(0, n, step)])
+        starts, stops = present_runs(x, step, known)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
+        np.testing.assert_array_equal(starts, edges[::2])
+        np.testing.assert_array_equal(stops, edges[1::2])
+        shifts = np.array([0, 0, 1, 4])
+        places, size = pyramid_places(n + 1, np.array([1, 2, 16, 160]), shifts)
+        flat = np.empty(size)
+        largest = integrate(x, 1.0, starts, stops, flat[: n + 1])
+        thin_pyramid(flat, n + 1, 4, 0, n + 1)
+        theta = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(x), x - 1.0, 0.0))])
+        assert largest == np.abs(theta).max()
+        for place, shift in zip(places, shifts, strict=True):
+            want = theta[:: 2**shift]
+            np.testing.assert_array_equal(flat[place : place + want.size], want)
+
+    def test_memory_that_others_have_used_changes_no_bit(self):
+        rng, space = np.random.default_rng(4), Workspace()
+        whole, broken = rng.standard_normal((2, 30_000))
+        broken[rng.random(30_000) < 0.02] = np.nan
+        broken[4000] = 1e9  # kept as two doubles
+        for x, angle, octave, n_tau in [
+            (whole, False, False, 60),
+            (broken, False, True, 20),
+            (broken, True, False, 30),
+            (whole, False, True, 9),
+        ]:
+            ks = np.arange(1, n_tau + 1) * 8 if octave else np.arange(1, n_tau + 1)
+            unit = Unit(1000, 300, ks, thin(ks) if octave else np.zeros_like(ks), angle, 0.01, False, 0.3, 0.1)
+            for fresh, used in zip(surface_unit(x, unit), surface_unit(x, unit, space), strict=True):
+                np.testing.assert_array_equal(fresh, used)
