@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from dataclasses import dataclass
 
 from gyrostab.errors import UnitError
@@ -41,48 +42,100 @@ _RATE = 3600.0  # deg/s -> deg/h
 
 # spelling -> (quantity, factor to the inner unit, offset in the inner unit)
 _SPELLINGS: dict[str, tuple[str, float, float]] = {}
+# (quantity, plain form of a spelling) -> the same; None where two spellings of a quantity differ in their case only
+_PLAIN: dict[tuple[str, str], tuple[str, float, float] | None] = {}
+
+# Words of unit strings -> the one form that `_plain` gives them.
+_WORDS = {
+    word: short
+    for short, words in {
+        "deg": "degree degrees degs",
+        "rad": "radian radians",
+        "mrad": "milliradian milliradians",
+        "arcsec": "arcsecond arcseconds arcsecs asec",
+        "s": "second seconds sec secs",
+        "h": "hour hours hr hrs",
+        "min": "minute minutes",
+        "rev": "revolution revolutions revs turn turns",
+        "celsius": "centigrade celcius",
+        "gauss": "gausses",
+        "count": "counts lsb",
+    }.items()
+    for word in words.split()
+}
+
+
+def _normal(text: str) -> str:
+    """One spelling for ``rad s^-1``, ``rad*s**-1``, ``rad s⁻¹`` and ``rad s-1``; letters keep their case."""
+    text = re.sub("[º˚]", "°", text.strip())  # ordinal sign and ring, often typed for the degree sign
+    text = unicodedata.normalize("NFKC", text).replace("\N{MINUS SIGN}", "-")
+    text = text.replace("**", "^").replace("^-", "-").replace("·", " ").replace("*", " ")
+    return re.sub(r"\s+", " ", text)
+
+
+def _plain(text: str) -> str:
+    """The form in which spellings are compared where case, blanks and words such as `seconds` make no difference."""
+    text = _normal(text).casefold().replace("°", "deg ").replace(" per ", "/").replace("^", "")
+    text = re.sub(r"[a-zμ]+", lambda word: _WORDS.get(word[0], word[0]), text.replace("_", " "))
+    text = re.sub(r"\s*/\s*", "/", text)
+    text = re.sub(r"[ .]?\b([a-z]+)-([12])\b", lambda part: f"/{part[1]}{part[2].replace('1', '')}", text)
+    return text.replace(" ", "")
 
 
 def _add(quantity: str, factor: float, *spellings: str, offset: float = 0.0) -> None:
+    known = (quantity, factor, offset)
     for spelling in spellings:
-        _SPELLINGS[spelling] = (quantity, factor, offset)
+        _SPELLINGS[_normal(spelling)] = known
+        key = quantity, _plain(spelling)
+        _PLAIN[key] = known if _PLAIN.get(key, known) == known else None
 
 
-_add("rate", 1.0, "deg/h", "deg/hr", "degree/hour", "degree hour-1", "degree h-1", "deg h-1", "dph", "°/h", "deg/hour")
-_add("rate", _RATE, "deg/s", "deg/sec", "degree/second", "degree s-1", "deg s-1", "dps", "°/s", "degree/s")
-_add("rate", _RATE / _DEGREE, "rad/s", "rad s-1", "radian s-1", "radian/s", "rad/sec")
-_add("rate", 1e-3 * _RATE / _DEGREE, "mrad/s", "mrad s-1", "milliradian s-1")
-_add("rate", 1e-6 * _RATE / _DEGREE, "urad/s", "urad s-1", "µrad/s", "μrad/s", "microradian s-1")
-_add("rate", 1e-9 * _RATE / _DEGREE, "nrad/s", "nrad s-1", "nanoradian s-1")
-_add("rate", 1.0, "arcsec/s", "arcsec s-1", "arcsecond s-1")  # 1 arcsec/s = 3600 arcsec/h = 1 deg/h
-_add("rate", 6.0 * _RATE, "rpm", "RPM", "r/min", "rev/min")
-_add("angle", 1.0, "deg", "degree", "degrees", "°")
-_add("angle", 1.0 / 3600.0, "arcsec", "arcsecond", '"')
-_add("angle", 1.0 / _DEGREE, "rad", "radian")
-_add("angle", 1e-3 / _DEGREE, "mrad", "milliradian")
-_add("angle", 1e-6 / _DEGREE, "urad", "microradian")
-_add("temperature", 1.0, "degC", "C", "°C", "celsius", "degree_Celsius", "degrees_Celsius", "deg_C")
-_add("temperature", 1.0, "K", "kelvin", offset=-273.15)
-_add("temperature", 5.0 / 9.0, "degF", "F", "°F", "degree_Fahrenheit", offset=-160.0 / 9.0)
-_add("acceleration", 1.0, "g", "gn", "gee", "9.80665 m s-2")
-_add("acceleration", 1e-3, "mg", "milli-g")
-_add("acceleration", 1.0 / 9.80665, "m/s^2", "m/s2", "m s-2", "m/s/s", "m/s²")
-_add("voltage", 1.0, "V", "volt")
-_add("voltage", 1e-3, "mV")
-_add("power", 1.0, "W", "watt")
+_add("rate", 1.0, "deg/h", "dph")
+_add("rate", _RATE, "deg/s", "dps")
+_add("rate", 1e-3 * _RATE, "mdeg/s", "mdps")
+_add("rate", _RATE / _DEGREE, "rad/s")
+_add("rate", 1e-3 * _RATE / _DEGREE, "mrad/s")
+_add("rate", 1e-6 * _RATE / _DEGREE, "urad/s", "µrad/s", "microradian s-1")
+_add("rate", 1e-9 * _RATE / _DEGREE, "nrad/s", "nanoradian s-1")
+_add("rate", 1.0, "arcsec/s")  # 1 arcsec/s = 3600 arcsec/h = 1 deg/h
+_add("rate", 6.0 * _RATE, "rpm", "r/min", "rev/min")
+_add("rate", 360.0 * _RATE, "rev/s", "r/s")
+_add("rate", 6.0, "deg/min")
+_add("angle", 1.0, "deg")
+_add("angle", 1.0 / 3600.0, "arcsec", '"')
+_add("angle", 1.0 / _DEGREE, "rad")
+_add("angle", 1e-3 / _DEGREE, "mrad")
+_add("angle", 1e-6 / _DEGREE, "urad", "µrad", "microradian")
+_add("temperature", 1.0, "degC", "C", "celsius", "deg celsius")
+_add("temperature", 1.0, "K", "kelvin", "degK", offset=-273.15)
+_add("temperature", 5.0 / 9.0, "degF", "F", "fahrenheit", "deg fahrenheit", offset=-160.0 / 9.0)
+_add("acceleration", 1.0, "g", "gn", "gee", "gs", "g0", "g_n", "9.80665 m s-2")
+_add("acceleration", 1e-3, "mg", "milli-g", "milli g", "millig", "mgee")
+_add("acceleration", 1e-6, "ug", "µg", "micro-g", "microg")
+_add("acceleration", 1.0 / 9.80665, "m/s2", "m/s/s", "mps2", "meter/s2", "metre/s2", "meters/s2", "m/sec^2")
+_add("acceleration", 1e-2 / 9.80665, "gal", "cm/s2")
+_add("acceleration", 0.3048 / 9.80665, "ft/s2")
+_add("voltage", 1.0, "V", "volt", "volts", "Vdc")
+_add("voltage", 1e-3, "mV", "millivolt", "millivolts")
+_add("power", 1.0, "W", "watt", "watts")
 _add("power", 1e-3, "mW")
-_add("power", 1e-6, "uW", "µW", "μW")
-_add("pressure", 1.0, "Pa", "pascal")
-_add("pressure", 1e2, "hPa", "mbar")
-_add("pressure", 1e3, "kPa")
-_add("pressure", 1e5, "bar")
+_add("power", 1e-6, "uW", "µW")
+_add("pressure", 1.0, "Pa", "pascal", "pascals")
+_add("pressure", 1e2, "hPa", "mbar", "millibar", "mb", "hectopascal")
+_add("pressure", 1e3, "kPa", "kilopascal")
+_add("pressure", 1e4, "dbar", "decibar")
+_add("pressure", 1e5, "bar", "bars", "bara")
 _add("pressure", 1e6, "MPa")
-_add("pressure", 6894.757293168361, "psi")
-_add("magnetic", 1.0, "uT", "µT", "μT", "microtesla")
-_add("magnetic", 1e-3, "nT", "nanotesla")
+_add("pressure", 1e-3, "mPa")
+_add("pressure", 6894.757293168361, "psi", "psia", "lbf/in2")
+_add("pressure", 101325.0, "atm")
+_add("magnetic", 1.0, "uT", "µT", "microtesla", "microteslas")
+_add("magnetic", 1e-3, "nT", "nanotesla", "gamma")
+_add("magnetic", 1e3, "mT", "millitesla")
 _add("magnetic", 1e6, "T", "tesla")
-_add("magnetic", 100.0, "G", "gauss", "Gauss")
-_add("number", 1.0, "1", "-", "count", "counts", "")
+_add("magnetic", 100.0, "G", "gauss", "Gs")
+_add("magnetic", 0.1, "mG", "milligauss", "mgauss")
+_add("number", 1.0, "1", "-", "count", "")
 
 _NUMBER = re.compile(r"^([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*\*?\s*(.+)$")
 
@@ -97,19 +150,17 @@ class Unit:
     offset: float = 0.0
 
 
-def _normal(text: str) -> str:
-    """One spelling for ``rad s^-1``, ``rad*s**-1`` and ``rad s-1``."""
-    text = text.strip().replace("**", "^").replace("^-", "-")
-    return re.sub(r"\s+", " ", text)
-
-
-def parse_unit(text: str) -> Unit:
+def parse_unit(text: str, quantity: str | None = None) -> Unit:
     """Read a unit string, with an optional factor in front.
+
+    Case, blanks and written-out words (``DEG/HR``, ``degrees per second``) make no difference where the unit stays clear.
 
     Parameters
     ----------
     text : str
         For instance ``"deg/h"``, ``"rad s^-1"``, ``"0.1 arcsec/s"`` (a count of 0.1 arcsec/s).
+    quantity : str, optional
+        A key of `INNER` that is expected; it decides between spellings such as ``G``, gauss or the acceleration.
 
     Returns
     -------
@@ -129,19 +180,35 @@ def parse_unit(text: str) -> Unit:
     0.1
     >>> parse_unit("9.80665 m s-2").quantity
     'acceleration'
+    >>> parse_unit("DEG/HR").factor, parse_unit("G", "acceleration").quantity
+    (1.0, 'acceleration')
     """
-    name = _normal(text)
-    if name in _SPELLINGS:
-        quantity, factor, offset = _SPELLINGS[name]
-        return Unit(text, quantity, factor, offset)
-    match = _NUMBER.match(name)
-    if match and _normal(match.group(2)) in _SPELLINGS:
-        quantity, factor, offset = _SPELLINGS[_normal(match.group(2))]
+    found = _find(text, quantity)
+    if found is not None:
+        return Unit(text, *found)
+    match = _NUMBER.match(_normal(text))
+    found = _find(match.group(2), quantity) if match else None
+    if match and found is not None:
+        kind, factor, offset = found
         scale = float(match.group(1))
         if scale == 0.0 or not math.isfinite(scale):
             raise UnitError(f"unit {text!r}: the factor {match.group(1)} is not usable; give a finite number other than 0")
-        return Unit(text, quantity, factor * scale, offset)
+        return Unit(text, kind, factor * scale, offset)
     raise UnitError(f"unit {text!r} is not known; known are, for instance, {known_units('rate')} for gyro axes")
+
+
+def _find(text: str, quantity: str | None) -> tuple[str, float, float] | None:
+    """Quantity, factor and offset of a spelling: as it is written, then with its case and blanks ignored."""
+    exact = _SPELLINGS.get(_normal(text))
+    if exact is not None and quantity in (None, exact[0]):
+        return exact
+    plain = _plain(text)
+    if quantity is not None and (found := _PLAIN.get((quantity, plain))):
+        return found
+    if exact is not None or len(plain) < 2:  # a single letter means what its case says
+        return exact
+    candidates = {known for kind in INNER if (known := _PLAIN.get((kind, plain)))}
+    return candidates.pop() if len(candidates) == 1 else None
 
 
 def known_units(quantity: str) -> str:
@@ -150,7 +217,7 @@ def known_units(quantity: str) -> str:
     Examples
     --------
     >>> known_units("pressure")
-    'Pa, hPa, kPa, bar, MPa, psi'
+    'Pa, hPa, kPa, dbar, bar, MPa, mPa, psi, atm'
     """
     seen: dict[tuple[float, float], str] = {}
     for spelling, (name, factor, offset) in _SPELLINGS.items():

@@ -53,3 +53,46 @@ def test_known_units_lists_the_contract():
     listed = known_units("rate")
     for text in ("deg/h", "deg/s", "rad/s", "mrad/s", "urad/s", "nrad/s", "arcsec/s", "rpm"):
         assert text in listed
+
+
+@pytest.mark.parametrize(
+    ("spellings", "meant"),
+    [
+        ("Celsius|celsius|°C|ºC|deg C|deg_C|degrees Celsius|degree_Celsius|DEGC|C", "degree_Celsius"),
+        ("Kelvin|K|deg K", "kelvin"),
+        ("degF|°F|DEGF|Fahrenheit", "degree_Fahrenheit"),
+        ("deg/hr|DEG/HR|DEG/H|°/hr|° / h|degrees per hour|deg h^-1|degree h-1", "degree hour-1"),
+        ("deg/sec|dps|°/s|º/s|Deg/Sec|degrees/second|degrees per second|deg.s-1|deg s⁻¹", "degree s-1"),
+        ("rad/sec|RAD/S|rad*s**-1|rad·s⁻¹|radians/second|rad.s^-1", "radian s-1"),
+        ("mdps|mdeg/s", "1e-3 degree s-1"),
+        ("rpm|RPM|rev/min|revs per minute", "6 degree s-1"),
+        ("rev/s|Rev/sec|revolutions per second", "360 degree s-1"),
+        ("µrad/s|μrad/s|urad/sec", "1e-6 radian s-1"),
+        ("m/s²|m s⁻²|m/sec^2|m/s/s|M/S2|m.s-2", "m s-2"),
+        ("ug|µg", "9.80665e-6 m s-2"),
+        ("dbar|DBAR|decibar", "1e4 Pa"),
+        ("mbar|millibar|hPa|HPA", "100 Pa"),
+        ("mG|milligauss|mGauss", "1e-7 T"),
+        ("Gauss|gauss|GAUSS", "1e-4 T"),
+        ("nT|NT|nanotesla", "1e-9 T"),
+        ("mT", "1e-3 T"),
+        ("mV|MV|millivolts", "1e-3 V"),
+        ("mPa", "1e-3 Pa"),
+    ],
+)
+def test_spellings_of_other_programs(spellings, meant):
+    for text in spellings.split("|"):
+        unit = parse_unit(text)
+        inner = cf_units.Unit(on_disk(INNER[unit.quantity]))
+        for value in (1.0, -37.5):
+            expected = cf_units.Unit(meant).convert(value, inner)
+            assert value * unit.factor + unit.offset == pytest.approx(expected, rel=1e-9, abs=1e-9), text
+
+
+def test_the_expected_quantity_decides_where_case_does_not():
+    assert parse_unit("G").quantity == "magnetic"
+    assert parse_unit("G", "acceleration").quantity == "acceleration"
+    assert parse_unit("MG", "magnetic").factor == pytest.approx(0.1)
+    for unclear in ("MPA", "MG", "t"):  # mega or milli, acceleration or field, tesla or tonne
+        with pytest.raises(UnitError):
+            parse_unit(unclear)
