@@ -90,7 +90,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     extra: Any = {"consolidated": False} if path.is_dir() else {}
     try:
-        stored = xr.open_dataset(path, engine=engine, chunks={}, decode_times=False, **extra)
+        stored = xr.open_dataset(path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False, **extra)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
     has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
@@ -99,7 +99,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
         if path.is_dir():
             raise FormatError(f"{path.name}: this Zarr store is no gyrostab log (axis and time, attribute sampling_rate_hz)")
         return None
-    log = xr.decode_cf(stored)
+    log = xr.decode_cf(stored.chunk())  # an index would hold every stamp in memory
     if path.is_dir():
         log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
     log.set_close(stored.close)
