@@ -151,7 +151,8 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
     n = n // 10 if quick and name != "x1" else n
     x = np.random.default_rng(0).standard_normal(n)
     log = make_log(x, rate=RATE, unit="deg/h")
-    options = {"window": window, "step": step, "taus": "all" if taus == "all" else 32, "tau_max": (window // 2 - 1) / RATE}
+    length = {"window": f"{window}samples", "step": f"{step}samples"}
+    options = {**length, "taus": "all" if taus == "all" else 32, "tau_max": (window // 2 - 1) / RATE}
     tau = np.asarray(davar(log, **options).tau)
     unit = make_unit(np.round(tau * RATE).astype(np.int64), window, step, RATE, octave=False)
     parts = pieces(x, unit)

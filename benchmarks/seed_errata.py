@@ -56,7 +56,7 @@ def _averages(rate: Array, k: int) -> Array:
 def _avar(values: Array, k: int, *, kind: str = "rate", gaps: str = "bridge") -> float:
     """Allan variance of samples at 100 Hz over all of the record, as one window."""
     log = make_log(values, rate=100.0, unit="deg/h" if kind == "rate" else "deg", kind=kind)
-    return float(davar(log, window=values.size - (kind == "angle"), taus=[k / 100.0], gaps=gaps)["avar"].values.item())
+    return float(davar(log, window=f"{values.size - (kind == 'angle')}samples", taus=[k / 100.0], gaps=gaps)["avar"].values.item())
 
 
 def _filtered(density: Callable[[Array], Array], tau: float) -> float:
@@ -208,7 +208,7 @@ def _windows(size: int, window: int, step: int, where: str, said: int) -> Erratu
         "both ends count",
         f"windows of {window} in {size} samples, step {step}",
         float(said),
-        float(davar(log, window=window, step=step, taus=[0.01]).sizes["time"]),
+        float(davar(log, window=f"{window}samples", step=f"{step}samples", taus=[0.01]).sizes["time"]),
     )
 
 
@@ -260,7 +260,7 @@ def _folded_band() -> Erratum:
 def _step_for_walk() -> Erratum:
     step, hours = 0.27, 5.0 / 3600.0
     rate = 0.02 * _white(2000) + np.where(np.arange(2000) < 1000, 0.0, step)
-    surface = davar(make_log(rate, rate=400.0, unit="deg/h"), window=2000)
+    surface = davar(make_log(rate, rate=400.0, unit="deg/h"), window="2000samples")
     return Erratum(
         "P16 section 8",
         "K grows under vibration",

@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 
-__all__ = ["TAUS", "averaging_factors", "duration_seconds", "samples", "thin"]
+__all__ = ["TAUS", "averaging_factors", "duration_seconds", "is_bare_number", "samples", "thin"]
 
 #: What averaging times may be, for messages.
 TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
 _SAMPLES = re.compile(r"^\s*(\d+)\s*samples?\s*$")
+_NUMBER = re.compile(r"^\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
 
 
 def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2h") -> float:
     """Seconds of a duration: a number [s], a timedelta, or a string such as ``"10min"`` or ``"0.1s"``; a message names the examples.
+
+    Lengths that may also be counted in samples (window, step and block) are read by `samples`, which takes no bare number.
 
     Raises
     ------
@@ -33,10 +36,10 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
     """
     try:
         if isinstance(value, str):
-            seconds = pd.Timedelta(re.sub(r"(?<=[\d ])m$", "min", value.strip())).value / 1e9
-            if re.fullmatch(r"[\d.eE+-]+", value.strip()):
+            if is_bare_number(value):
                 raise OptionError(f"{option} {value!r} has no unit; write for instance {example}")
-        elif isinstance(value, (int, float, np.number)):
+            seconds = pd.Timedelta(re.sub(r"(?<=[\d ])m$", "min", value.strip())).value / 1e9
+        elif is_bare_number(value):
             seconds = float(value)
         else:
             seconds = pd.Timedelta(value).value / 1e9
@@ -50,16 +53,33 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
 
 
 def samples(value: Any, rate: float, option: str) -> int:
-    """Whole samples of a length of time, or of a number of samples (an integer or ``"2000samples"``).
+    """Whole samples of a duration, or of a number of samples such as ``"2000samples"``.
+
+    Parameters
+    ----------
+    value : str or timedelta
+        The length. A bare number is refused: it could be seconds or samples.
+    rate : float
+        Sampling rate [Hz].
+    option : str
+        Name of the option, for messages.
+
+    Raises
+    ------
+    OptionError
+        When it is a bare number, cannot be read, or is shorter than one sample.
 
     Examples
     --------
-    >>> samples("10s", 400.0, "window"), samples("2000samples", 400.0, "window"), samples(30, 400.0, "step")
-    (4000, 2000, 30)
+    >>> samples("10s", 400.0, "window"), samples("2000samples", 400.0, "window")
+    (4000, 2000)
     """
+    if is_bare_number(value):
+        text = str(value).strip()
+        raise OptionError(f"{option} {text} has no unit; write '{text}s' for seconds or '{text}samples' for samples")
     match = _SAMPLES.match(value) if isinstance(value, str) else None
-    if match or (isinstance(value, (int, np.integer)) and not isinstance(value, bool)):
-        count = int(match.group(1)) if match else int(value)
+    if match:
+        count = int(match.group(1))
         if count < 1:
             raise OptionError(f"{option} of {count} samples: give at least 1")
         return count
@@ -68,6 +88,19 @@ def samples(value: Any, rate: float, option: str) -> int:
     if count < 1:
         raise OptionError(f"{option} {value!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more")
     return count
+
+
+def is_bare_number(value: Any) -> bool:
+    """Whether a length is given as a number without a unit, also one written as text.
+
+    Examples
+    --------
+    >>> is_bare_number(60), is_bare_number("60"), is_bare_number("60s")
+    (True, True, False)
+    """
+    if isinstance(value, str):
+        return bool(_NUMBER.match(value))
+    return isinstance(value, int | float | np.number) and not isinstance(value, np.timedelta64)
 
 
 def averaging_factors(taus: Any, *, rate: float, window: int, tau_max: Any = None) -> NDArray[np.int64]:

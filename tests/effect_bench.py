@@ -88,7 +88,11 @@ def random_cuts(seed: int, size: int, pieces: int = 5) -> list[int]:
 def avar(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:
     """Allan variance of every row over the whole record."""
     log = make_log(np.atleast_2d(rates), rate=rate, unit="deg/h")
-    return davar(log, window=log.sizes["time"], taus=[float(tau) for tau in taus], tau_max=float(max(taus))).avar.isel(time=0).values
+    return (
+        davar(log, window=f"{log.sizes['time']}samples", taus=[float(tau) for tau in taus], tau_max=float(max(taus)))
+        .avar.isel(time=0)
+        .values
+    )
 
 
 def sigma(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:

@@ -47,7 +47,15 @@ PATTERNS = {
 def surface(x: np.ndarray, ks: list[int], *, window: int = N, step: int | None = None, **options):
     log = make_log(x, rate=1.0, unit="deg/h", axis=[f"a{i}" for i in range(np.atleast_2d(x).shape[0])])
     ks = [k for k in ks if 2 * k <= window]
-    made = davar(log, window=window, step=step or window, taus=[float(k) for k in ks], min_strict=1.01, min_coverage=0.0, **options)
+    made = davar(
+        log,
+        window=f"{window}samples",
+        step=f"{step or window}samples",
+        taus=[float(k) for k in ks],
+        min_strict=1.01,
+        min_coverage=0.0,
+        **options,
+    )
     return made.load()
 
 

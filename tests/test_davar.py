@@ -62,7 +62,9 @@ class TestAgainstTheDefinition:
             x = x[: window + 200 * step]
         log = log_of(x) if chunk is None else log_of(x).chunk(time=chunk)
         with dask.config.set(scheduler="sync"):
-            result = davar(log, window=window, step=step, taus=[k / 100 for k in ks], min_strict=0.0, min_coverage=0.0).load()
+            result = davar(
+                log, window=f"{window}samples", step=f"{step}samples", taus=[k / 100 for k in ks], min_strict=0.0, min_coverage=0.0
+            ).load()
         x = x.astype(np.float64)
         avar, count = direct_surface(x, window, step, ks)
         np.testing.assert_array_equal(result["count"].values[0], count)
@@ -83,7 +85,7 @@ class TestAgainstTheDefinition:
         if (x.size - 1 - window) // step > 200:
             x = x[: window + 1 + 200 * step]
         log = make_log(x / 3600, rate=100.0, unit="deg", kind="angle")
-        result = davar(log, window=window, step=step, taus=[k / 100 for k in ks], min_coverage=0.0)
+        result = davar(log, window=f"{window}samples", step=f"{step}samples", taus=[k / 100 for k in ks], min_coverage=0.0)
         avar, count = direct_angle_surface(x, window, step, ks, 0.01)
         np.testing.assert_array_equal(result["count"].values[0], count)
         floor = 1e-11 * np.nanmax(np.abs(x), initial=1.0) ** 2 * 1e4
@@ -92,7 +94,7 @@ class TestAgainstTheDefinition:
     def test_thinned_terms_are_the_multiples_of_the_stride(self):
         x = np.random.default_rng(2).standard_normal(9000)
         x[3000:3040] = np.nan
-        result = davar(log_of(x), window=4000, step=700, taus=24, overlap="octave", min_strict=0.0)
+        result = davar(log_of(x), window="4000samples", step="700samples", taus=24, overlap="octave", min_strict=0.0)
         ks = np.round(result.tau.values * 100).astype(int)
         shifts = np.maximum(np.floor(np.log2(ks)).astype(int) - 3, 0)
         assert np.all(ks % 2**shifts == 0)
@@ -122,7 +124,7 @@ class TestAgainstPeers:
     def test_agrees_with_allantools_in_every_window(self, window):
         rng = np.random.default_rng(3)
         x = rng.standard_normal(5000) + 0.05 * np.cumsum(rng.standard_normal(5000))
-        result = davar(log_of(x), window=window, step=500, taus="all", tau_max=4.0)
+        result = davar(log_of(x), window=f"{window}samples", step="500samples", taus="all", tau_max=4.0)
         for j in (0, 3, result.sizes["time"] - 1):
             part = x[j * 500 : j * 500 + window]
             tau, deviation, _, n = allantools.oadev(part, rate=100.0, data_type="freq", taus=result.tau.values)
@@ -135,7 +137,7 @@ class TestAgainstPeers:
         x = np.random.default_rng(4).standard_normal((2, 6000))
         x[1, 2000:2300] = np.nan
         log = log_of(x)
-        options = {"window": 1000, "step": 30, "taus": 20, "min_strict": 0.0}
+        options = {"window": "1000samples", "step": "30samples", "taus": 20, "min_strict": 0.0}
         slow, fast = davar(log, method=method, **options), davar(log, **options)
         np.testing.assert_array_equal(slow["count"], fast["count"])
         np.testing.assert_allclose(slow.avar, fast.avar, rtol=1e-8)
@@ -143,18 +145,18 @@ class TestAgainstPeers:
 
     def test_the_papers_convention_counts_fewer_terms_and_windows(self):
         x = np.random.default_rng(5).standard_normal(6000)
-        paper = davar(log_of(x), window=1000, step=30, taus=[0.1], method="direct", convention="paper")
-        ours = davar(log_of(x), window=1000, step=30, taus=[0.1])
+        paper = davar(log_of(x), window="1000samples", step="30samples", taus=[0.1], method="direct", convention="paper")
+        ours = davar(log_of(x), window="1000samples", step="30samples", taus=[0.1])
         assert (paper.sizes["time"], ours.sizes["time"]) == (166, 167)
         assert (int(paper["count"][0, 0, 0]), int(ours["count"][0, 0, 0])) == (980, 981)
-        recursive = davar(log_of(x), window=1000, step=30, taus=[0.1], method="recursive", convention="paper")
+        recursive = davar(log_of(x), window="1000samples", step="30samples", taus=[0.1], method="recursive", convention="paper")
         np.testing.assert_allclose(recursive.avar, paper.avar, rtol=1e-9)
 
     def test_zero_filling_makes_the_canyon_and_counting_removes_it(self):
         """P16 divides by the gap-free number of terms: the surface sinks by the share of terms that are missing."""
         x = np.random.default_rng(6).standard_normal(40_000)
         x[20_000:20_400] = np.nan
-        options = {"window": 2000, "step": 200, "taus": [0.01]}
+        options = {"window": "2000samples", "step": "200samples", "taus": [0.01]}
         zero, bridge = (davar(log_of(x), gaps=gaps, **options).isel(axis=0, tau=0) for gaps in ("zero", "bridge"))
         inside = zero.coverage < 0.9
         assert inside.sum() >= 8
@@ -171,7 +173,7 @@ class TestInvariance:
         x = rng.standard_normal((2, 20_000))
         x[0, 5000:5003] = x[1, rng.random(20_000) < 0.1] = np.nan
         log = log_of(x, channels={"temperature": (np.linspace(20, 30, 20_000), "degC")})
-        options = {"window": 3000, "step": 250, "taus": 15, "overlap": overlap}
+        options = {"window": "3000samples", "step": "250samples", "taus": 15, "overlap": overlap}
         whole = davar(log, **options)
         with dask.config.set(scheduler="sync"):
             lazy = davar(log.chunk(time=chunk), **options)
@@ -185,7 +187,7 @@ class TestInvariance:
         rows[1, 5000:9000] = np.nan
         log = log_of(rows)
         log = log.assign(rate=(log.rate.dims, held(rows, 30_000), log.rate.attrs))
-        options = {"window": 4000, "step": 1000, "taus": 20}
+        options = {"window": "4000samples", "step": "1000samples", "taus": 20}
         whole, space = davar(log, **options).load(), Workspace()
         parts = [davar_part(log, part=part, space=space, **options) for part in davar_parts(log, samples=10_000, **options)]
         assert len(parts) > 1
@@ -205,7 +207,7 @@ class TestInvariance:
             raise AssertionError("the log was computed")
 
         data = da.map_blocks(forbidden, chunks=((1,), (5000,) * 4), dtype=float, meta=np.empty((0, 0)))
-        surface = davar(log_of(data), window=3000, step=1000)
+        surface = davar(log_of(data), window="3000samples", step="1000samples")
         assert surface.avar.shape[1] == 18
         with pytest.raises(AssertionError, match="the log was computed"):
             surface.avar.compute(scheduler="sync")
@@ -213,27 +215,27 @@ class TestInvariance:
     @pytest.mark.parametrize("dtype", [np.float32, np.int16, np.int32, np.int64])
     def test_narrow_types_are_summed_in_double(self, dtype):
         x = (np.random.default_rng(8).standard_normal(5000) * 50 + 2000).astype(dtype)
-        narrow = davar(log_of(x), window=1000, step=100)
-        wide = davar(log_of(x.astype(np.float64)), window=1000, step=100)
+        narrow = davar(log_of(x), window="1000samples", step="100samples")
+        wide = davar(log_of(x.astype(np.float64)), window="1000samples", step="100samples")
         np.testing.assert_allclose(narrow.avar, wide.avar, rtol=1e-12)
 
     def test_integers_are_exact_however_large_their_mean(self):
         x = np.random.default_rng(9).integers(-3, 4, 5000)
-        small = davar(log_of(x), window=1000, step=100)
-        large = davar(log_of(x + 2**40), window=1000, step=100)
+        small = davar(log_of(x), window="1000samples", step="100samples")
+        large = davar(log_of(x + 2**40), window="1000samples", step="100samples")
         np.testing.assert_array_equal(large.avar, small.avar)
 
     def test_axes_are_independent(self):
         x = np.random.default_rng(10).standard_normal((3, 5000))
         x[1, 100:200] = np.nan
-        together = davar(log_of(x), window=1000)
-        alone = davar(log_of(x), window=1000, axis="y")
+        together = davar(log_of(x), window="1000samples")
+        alone = davar(log_of(x), window="1000samples", axis="y")
         xr.testing.assert_identical(together.avar.sel(axis=["y"]), alone.avar)
 
     def test_scaling_and_constant(self):
         x = np.random.default_rng(11).standard_normal(5000)
-        base = davar(log_of(x), window=1000).avar
-        np.testing.assert_allclose(davar(log_of(1e4 * x + 7e6), window=1000).avar, 1e8 * base, rtol=1e-7)
+        base = davar(log_of(x), window="1000samples").avar
+        np.testing.assert_allclose(davar(log_of(1e4 * x + 7e6), window="1000samples").avar, 1e8 * base, rtol=1e-7)
 
 
 class TestAccuracy:
@@ -243,20 +245,20 @@ class TestAccuracy:
         shock = 30_000
         x[shock : shock + 200] += 1e6 * rng.standard_normal(200)
         taus = np.unique(np.round(np.geomspace(1, 999, 20)).astype(int)) / 100
-        result = davar(log_of(x), window=2000, step=300, taus=list(taus))
+        result = davar(log_of(x), window="2000samples", step="300samples", taus=list(taus))
         starts = np.arange(result.sizes["time"]) * 300
         after = starts >= shock + 200
         want, _ = direct_surface(x[starts[after][0] :], 2000, 300, list(np.round(taus * 100).astype(int)))
         error = np.abs(result.avar.values[0][after][: want.shape[0]] / want - 1)
         assert error.max() <= 1e-9
-        recursive = davar(log_of(x), window=2000, step=300, taus=list(taus), method="recursive")
+        recursive = davar(log_of(x), window="2000samples", step="300samples", taus=list(taus), method="recursive")
         assert np.abs(recursive.avar.values[0][after][: want.shape[0]] / want - 1).max() > 1e-4
 
     @pytest.mark.parametrize("turn", [1800.0, 108_000.0])  # deg/s; the second is 300 rev/s
     def test_a_rotating_tool_keeps_its_noise(self, turn):
         noise = 3e-3 * 60 * np.sqrt(400.0) * np.random.default_rng(3).standard_normal(50_000)
-        still = davar(log_of(noise, rate=400.0), window=20_000, step=10_000)
-        rotating = davar(log_of(noise + turn * 3600, rate=400.0), window=20_000, step=10_000)
+        still = davar(log_of(noise, rate=400.0), window="20000samples", step="10000samples")
+        rotating = davar(log_of(noise + turn * 3600, rate=400.0), window="20000samples", step="10000samples")
         np.testing.assert_allclose(rotating.avar, still.avar, rtol=1e-6)
 
 
@@ -265,7 +267,7 @@ class TestGaps:
         rng = np.random.default_rng(12)
         x = rng.standard_normal(20_000)
         x[rng.random(20_000) < 0.2] = np.nan
-        result = davar(log_of(x), window=20_000, step=20_000, taus=[0.01, 0.05, 1.0]).isel(axis=0, time=0)
+        result = davar(log_of(x), window="20000samples", step="20000samples", taus=[0.01, 0.05, 1.0]).isel(axis=0, time=0)
         assert list(result.estimator.values) == [STRICT, WEIGHTED, WEIGHTED]
         # white noise is seen too high, by exactly what the mask says
         assert float(result.white_response.sel(tau=1.0)) == pytest.approx(1.25, abs=0.02)
@@ -295,7 +297,7 @@ class TestGaps:
         quantization = np.where(here, np.diff(rng.standard_normal((trials, n + 1)), axis=1), np.nan)
         names = [str(i) for i in range(trials)]
         for x, law, response in ((white, lambda k: 1 / k, "white_response"), (quantization, lambda k: 3 / k**2, "quantization_response")):
-            surface = davar(log_of(x, axis=names), window=n, step=n, taus=[0.01, 0.05, 0.2, 1.0, 3.0]).isel(time=0)
+            surface = davar(log_of(x, axis=names), window=f"{n}samples", step=f"{n}samples", taus=[0.01, 0.05, 0.2, 1.0, 3.0]).isel(time=0)
             k = np.round(surface.tau * 100)
             ratio = surface.avar.mean("axis") / law(k)
             scatter = (surface.avar.std("axis") / law(k)) / np.sqrt(trials)
@@ -304,7 +306,7 @@ class TestGaps:
     def test_an_empty_window_is_nan_not_zero(self):
         x = np.random.default_rng(14).standard_normal(6000)
         x[2000:4000] = np.nan
-        result = davar(log_of(x), window=1000, step=500).isel(axis=0)
+        result = davar(log_of(x), window="1000samples", step="500samples").isel(axis=0)
         empty = result.window_coverage == 0
         assert empty.sum() == 3
         assert result.avar[empty].isnull().all()
@@ -315,7 +317,7 @@ class TestGaps:
     def test_thin_cells_are_blank_not_low(self):
         x = np.full(1000, np.nan)
         x[:60] = np.random.default_rng(15).standard_normal(60)
-        result = davar(log_of(x), window=1000, min_coverage=0.1)
+        result = davar(log_of(x), window="1000samples", min_coverage=0.1)
         assert result.avar.isnull().all()
 
 
@@ -339,7 +341,7 @@ class TestLabels:
         slow_times = np.arange(0, n, 100)
         log["pressure"] = ("time_pressure", 1e5 + slow_times, {"units": "Pa"})
         log = log.assign_coords(time_pressure=log.time.isel(time=slice(0, None, 100)).values)
-        result = davar(log, window=1000, step=500)
+        result = davar(log, window="1000samples", step="500samples")
         np.testing.assert_allclose(result.temperature_rate.values[[0, 5]], 60.0, rtol=1e-9)
         assert result.temperature_rate.units == "K hour-1"
         np.testing.assert_allclose(result.temperature.values[6], temperature[3000:4000].mean())
@@ -355,7 +357,11 @@ class TestLabels:
             ({"window": "10s", "taus": [0.001]}, "shorter than one sample"),
             ({"window": "10s", "tau_max": "9s"}, "does not fit the window"),
             ({"window": "3samples"}, "at least 4"),
-            ({"window": "10"}, "has no unit"),
+            ({"window": "10"}, "has no unit; write '10s' for seconds or '10samples' for samples"),
+            ({"window": 10}, "has no unit; write '10s' for seconds or '10samples' for samples"),
+            ({"window": 10.0}, "has no unit; write '10.0s' for seconds"),
+            ({"window": np.int64(1000)}, "has no unit; write '1000s' for seconds or '1000samples'"),
+            ({"window": "10s", "step": 100}, "step 100 has no unit"),
             ({"window": "soon"}, "not a duration"),
             ({"window": "-10s"}, "longer than zero"),
             ({"window": "10s", "taus": 0}, "above 0"),
@@ -392,7 +398,9 @@ def test_published_wavelet_variances_are_ours(recordings):
         taus = list(rows["haar_scale_s"].to_numpy() / 2)
         x = frame[column].to_numpy().astype(np.float64)
         log = make_log(x, rate=100.0, unit="deg/s")
-        surface = davar(log, window=x.size, step=x.size, taus=[tau for tau in taus if tau <= x.size / 200], tau_max=x.size / 200)
+        surface = davar(
+            log, window=f"{x.size}samples", step=f"{x.size}samples", taus=[tau for tau in taus if tau <= x.size / 200], tau_max=x.size / 200
+        )
         ours = surface.avar.values[0, 0] / 2 / 3600.0**2
         np.testing.assert_allclose(ours, rows["haar_wavelet_variance"].to_numpy()[: ours.size], rtol=1e-8)
         compared += ours.size

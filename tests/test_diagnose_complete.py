@@ -31,7 +31,7 @@ def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Datas
     rates = rng.standard_normal((1, BLOCKS * LENGTH)) * np.repeat(factor, LENGTH)
     if gaps:
         rates[:, np.repeat(rng.random(BLOCKS * 20) < 0.3, LENGTH // 20)] = np.nan
-    return reduce_log(make_log(rates, rate=10.0, unit="deg/h"), block=20.0)
+    return reduce_log(make_log(rates, rate=10.0, unit="deg/h"), block="20s")
 
 
 def left(reduced: xr.Dataset, *columns: np.ndarray) -> float:

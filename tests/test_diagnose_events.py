@@ -34,7 +34,7 @@ MODEL = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}}
 
 def reduced_of(rate: np.ndarray) -> xr.Dataset:
     """Rates (axis, time) [deg/h] in blocks of 20 s."""
-    return reduce_log(make_log(rate, rate=RATE, unit="deg/h"), block=20.0)
+    return reduce_log(make_log(rate, rate=RATE, unit="deg/h"), block="20s")
 
 
 def loud(factor: np.ndarray) -> np.ndarray:
@@ -162,7 +162,7 @@ def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(late: floa
     phase = 2.0 * np.pi * SECOND / 200.0
     rate = WHITE * np.random.default_rng(9).standard_normal((1, SECOND.size)) + 0.3 * np.sin(phase)
     shaking = np.sqrt(2.0 + np.sin(phase - late))
-    reduced = reduce_log(make_log(rate, rate=RATE, unit="deg/h", channels={"vibration": (shaking, "g")}), block=20.0)
+    reduced = reduce_log(make_log(rate, rate=RATE, unit="deg/h", channels={"vibration": (shaking, "g")}), block="20s")
     found = name_effects(reduced, *nulls(reduced, 40))
     assert [claim.effect for claim in found.claims] == named
 
@@ -181,7 +181,7 @@ def turned(rate: np.ndarray, turns: np.ndarray) -> State:
     """Rates (axis, time) [deg/h] with the channel of a tool that has made so many turns."""
     log = make_log(rate, rate=RATE, unit="deg/h")
     turning = 360.0 * np.gradient(turns, SECOND)
-    reduced = reduce_log(log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block=20.0)
+    reduced = reduce_log(log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block="20s")
     return begin_state(reduced, from_model(reduced, {**MODEL, "log": {"axes": ["x"]}}))
 
 

@@ -240,7 +240,7 @@ def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) ->
     log = make_log(
         np.repeat(step * course, 200) + noise, rate=10.0, unit="deg/h", channels={"supply_voltage": (np.repeat(supply, 200), "V")}
     )
-    reduced = reduce_log(log, block=20.0)
+    reduced = reduce_log(log, block="20s")
     return name_effects(reduced, *nulls(reduced, 40))
 
 

@@ -98,6 +98,6 @@ def test_coherency_tells_quadrature_and_its_sign() -> None:
 def test_logs_that_do_not_belong_together_are_refused() -> None:
     log = make_log(np.zeros((2, 600)), rate=10.0, unit="deg/h")
     with pytest.raises(OptionError, match="same two axes"):
-        plot_comparison(log, make_log(np.zeros((2, 500)), rate=10.0, unit="deg/h"), window=20.0)
+        plot_comparison(log, make_log(np.zeros((2, 500)), rate=10.0, unit="deg/h"), window="20s")
     with pytest.raises(OptionError, match="driver 'vibration' is not in the log"):
-        plot_comparison(log, log, window=20.0, driver="vibration")
+        plot_comparison(log, log, window="20s", driver="vibration")

@@ -34,7 +34,7 @@ RATE = 100.0
 def windows_of(x, **options):
     """Surface of independent trials, one window each, laid end to end on one axis."""
     n = x.shape[1]
-    return davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=n, step=n, **options)
+    return davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=f"{n}samples", step=f"{n}samples", **options)
 
 
 def records(kind, rng, trials, n):
@@ -216,7 +216,7 @@ def test_errors_widen_with_the_misfit_and_only_then():
 def test_a_pure_ramp_is_r():
     t = np.arange(20_000) / RATE / 3600
     x = 36.0 * t + 1e-3 * np.random.default_rng(8).standard_normal(20_000)
-    product = fit_noise(davar(make_log(x, rate=RATE, unit="deg/h"), window=5000))
+    product = fit_noise(davar(make_log(x, rate=RATE, unit="deg/h"), window="5000samples"))
     np.testing.assert_allclose(product.R, 36.0, rtol=2e-3)
 
 
@@ -248,7 +248,7 @@ def test_averaging_times_below_a_disturbance_can_be_left_out():
     """A tone at 5 Hz spoils tau below a second and with it N; from 2 s on the noise is as it was."""
     t = np.arange(300_000) / RATE
     x = white(np.random.default_rng(17), 1, t.size, N=0.01, rate=RATE)[0] + 40 * np.sin(2 * np.pi * 5.013 * t)
-    surface = davar(make_log(x, rate=RATE, unit="deg/h"), window=100_000, step=100_000)
+    surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="100000samples", step="100000samples")
     spoiled, clean = fit_noise(surface), fit_noise(surface, tau_min="5s")
     assert abs(float(clean.N.mean()) / 0.01 - 1) < 0.2
     assert abs(float(spoiled.N.mean()) / 0.01 - 1) > 0.5
@@ -275,15 +275,15 @@ def test_two_averaging_times_cannot_tell_five_terms_apart():
 def test_a_lazy_surface_stays_lazy_and_fits_the_same():
     x = np.random.default_rng(12).standard_normal((2, 20_000))
     log = make_log(x, rate=RATE, unit="deg/h")
-    eager = fit_noise(davar(log, window=2000, step=500))
-    lazy = fit_noise(davar(log.chunk(time=7000), window=2000, step=500))
+    eager = fit_noise(davar(log, window="2000samples", step="500samples"))
+    lazy = fit_noise(davar(log.chunk(time=7000), window="2000samples", step="500samples"))
     assert isinstance(lazy.N.data, da.Array)
     for name in (*TERMS, "N_stderr", "K_upper", "observable", "fit_chi2", "edf"):
         np.testing.assert_array_equal(lazy[name].values, eager[name].values)
 
 
 def test_many_averaging_times_are_thinned_for_the_fit():
-    surface = davar(make_log(np.random.default_rng(13).standard_normal(6000), rate=RATE, unit="deg/h"), window=3000, taus="all")
+    surface = davar(make_log(np.random.default_rng(13).standard_normal(6000), rate=RATE, unit="deg/h"), window="3000samples", taus="all")
     product = fit_noise(surface)
     assert product.sizes["tau"] == 1000
     assert product.edf.notnull().all()

@@ -86,7 +86,9 @@ def test_simulated_noise_follows_its_law_at_every_tau(term):
         "B": lambda: flicker(rng, trials, n, B=1.0),
         "K": lambda: random_walk(rng, trials, n, K=1.0, rate=rate),
     }[term]
-    surface = davar(make_log(make().reshape(-1), rate=rate, unit="deg/h"), window=n, step=n, taus="octave", tau_max=4.0)
+    surface = davar(
+        make_log(make().reshape(-1), rate=rate, unit="deg/h"), window=f"{n}samples", step=f"{n}samples", taus="octave", tau_max=4.0
+    )
     mean = surface.avar.mean("time").values[0]
     scatter = surface.avar.std("time").values[0] / np.sqrt(trials)
     assert np.all(np.abs(mean - LAWS[term].avar(surface.tau)) < 4.5 * scatter + 0.01 * mean)
@@ -96,7 +98,7 @@ def test_a_bias_step_looks_like_a_random_walk():
     """A step D inside a window of W hours gives D^2 tau / (3 (W - 2 tau)): an apparent K of D / sqrt(W)."""
     n, rate, step = 20_000, 100.0, 0.1
     x = np.where(np.arange(n) < n // 2, 0.0, step)
-    surface = davar(make_log(x, rate=rate, unit="deg/h"), window=n, step=n, taus=[0.1, 1.0, 2.0])
+    surface = davar(make_log(x, rate=rate, unit="deg/h"), window=f"{n}samples", step=f"{n}samples", taus=[0.1, 1.0, 2.0])
     window = n / rate
     expected = step**2 * surface.tau / (3 * (window - 2 * surface.tau))
     np.testing.assert_allclose(surface.avar[0, 0], expected, rtol=0.02)

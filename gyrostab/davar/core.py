@@ -66,9 +66,9 @@ def davar(
     log : xarray.Dataset
         Regular log with ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], NaN where a sample is
         missing, numpy or dask, float or integer. A dask log stays lazy and gives the same bits for any chunking.
-    window, step : str, timedelta or int
-        Length and step of the window: a duration (``"10min"``), or a number of samples (``2000`` or ``"2000samples"``).
-        `step` defaults to a tenth of the window.
+    window, step : str or timedelta
+        Length and step of the window: a duration (``"10min"``), or a number of samples (``"2000samples"``). A bare number
+        is refused. `step` defaults to a tenth of the window.
     taus : int, {"octave", "all"} or sequence
         Averaging times: so many, spaced evenly in log tau; powers of two samples; every one; or a list [s]
         (numbers, or strings such as ``"0.1s"``). Each is moved to a whole number of samples and reported exactly.

@@ -73,7 +73,8 @@ def diagnose(
         Number of null records.
     false_alarm_level : float
         Share of records of the simulation itself in which anything may be found.
-    block, restart_gap : str or float
+    block : str or timedelta
+    restart_gap : str or float
         As for `gyrostab.diagnose.reduction.reduced.reduce_log`.
     progress : Stage
         Is told of the progress.

@@ -85,7 +85,7 @@ def plot_comparison(
     figure = new_figure(7.6, 4.9)
     panels = figure.subplots(2, 2)
     pair = tuple(davar(log, window=window, step=step, taus=30, axis=[str(log["axis"].values[0])]).isel(axis=0).load() for log in logs)
-    seconds = duration_seconds(window, "window")
+    seconds = float(pair[0].attrs["window_s"])
     name = f"{seconds / 3600:g} h" if seconds >= 3600 else f"{seconds / 60:g} min" if seconds >= 600 else f"{seconds:g} s"
     if moments:
         _curves(panels[0, 0], logs, pair, [duration_seconds(moment, "moment") for moment in moments])
@@ -218,7 +218,7 @@ def _correlation(panel: Axes, logs: Any) -> None:
         sums = make_log(
             np.stack([x, y, x + y, x - y]), rate=log.attrs["sampling_rate_hz"], unit="deg/h", axis=["x", "y", "sum", "difference"]
         )
-        whole = davar(sums, window=sums.sizes["time"], taus=30).isel(time=0).load()
+        whole = davar(sums, window=f"{sums.sizes['time']}samples", taus=30).isel(time=0).load()
         a, b, plus, minus = whole["avar"].values
         with np.errstate(divide="ignore", invalid="ignore"):
             panel.semilogx(whole["tau"], (plus - minus) / 4.0 / np.sqrt(a * b), **style)

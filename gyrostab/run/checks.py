@@ -81,7 +81,7 @@ def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau
     --------
     >>> check_windows(window="10", step="1min")
     Traceback (most recent call last):
-    gyrostab.errors.OptionError: window '10' has no unit; write for instance 10min, 30s or 2000samples
+    gyrostab.errors.OptionError: window 10 has no unit; write '10s' for seconds or '10samples' for samples
     """
     from gyrostab.windows import TAUS, averaging_factors, duration_seconds, samples
 

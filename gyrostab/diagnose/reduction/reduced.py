@@ -41,8 +41,8 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
         Samples of the record.
     rate : float
         Sampling rate [Hz].
-    block : str or float, optional
-        Length that the user asks for.
+    block : str or timedelta, optional
+        Length that the user asks for: a duration, or a number of samples such as ``"2000samples"``.
 
     Raises
     ------
@@ -96,8 +96,8 @@ def reduce_log(
     ----------
     log : xarray.Dataset
         Regular log, in memory or lazy; it is read once, from front to back.
-    block : str or float, optional
-        Length of a block [s]; 20 s, or less in short records, by default.
+    block : str or timedelta, optional
+        Length of a block; 20 s, or less in short records, by default.
     restart_gap : str or float
         Gap from which on the power is taken to have been off [s].
     left_out : ndarray of bool, shape (axis, block), optional
