@@ -3,39 +3,35 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+import shlex
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
+from gyrostab.read.headers import (
+    AXIS,
+    KNOWN,
+    LOOKS_GYRO,
+    TIME,
+    Header,
+    distinct_columns,
+    example_unit,
+    free_name,
+    is_contract_name,
+    is_time_unit,
+    is_unit,
+    is_unit_of,
+    quantity_of,
+    split_header,
+    unit_quantity,
+)
 from gyrostab.read.options import ColumnSummary, ReadOptions
 from gyrostab.read.stamps import TimeUnit, parse_time_unit
 from gyrostab.units import INNER, known_units, parse_unit
 
 __all__ = ["Column", "Plan", "plan_columns", "split_header"]
-
-_BRACKET = re.compile(r"^(.*?)\s*\[([^\[\]]*)\]\s*$")
-_AXIS = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")
-_TIME_SUFFIX = r"s|sec|seconds?|ms|milliseconds?|us|microseconds?|ns|nanoseconds?|utc|iso"
-_TIME = re.compile(rf"^(?:time|timestamp|t)(?:_({_TIME_SUFFIX}))?$")
-_LOOKS_GYRO = [
-    re.compile(pattern, re.IGNORECASE) for pattern in (r"gyr|angular_?(rate|vel)|omega", r"^[gw]_?[xyz](_|$)|^w_rs", r"rate|rot")
-]
-
-#: Channel name, or the stem before an underscore -> quantity.
-_QUANTITIES = {
-    "temperature": "temperature",
-    "vibration": "acceleration",
-    "accel": "acceleration",
-    "rotation_rate": "rotation_rate",
-    "supply_voltage": "voltage",
-    "light_power": "power",
-    "pressure": "pressure",
-    "mag": "magnetic",
-    "ramp": "number",
-}
-_KNOWN = re.compile(r"^(temperature|vibration|rotation_rate|supply_voltage|light_power|pressure|ramp|accel_[xyz]|mag_[xyz])$")
 
 
 @dataclass(frozen=True)
@@ -82,41 +78,6 @@ class Plan:
         return next(iter(self.of("time")), None)
 
 
-@dataclass
-class _Header:
-    """A column while it is being understood."""
-
-    source: int
-    header: str
-    name: str
-    unit: str | None
-    stored: str | None = None  # the unit that the format keeps beside the header, weaker than --unit
-    mapped: bool = False
-    stamped: bool = False
-
-    @property
-    def low(self) -> str:
-        return self.name.lower()
-
-
-def split_header(text: str) -> tuple[str, str | None]:
-    """Name and unit of a header cell; a whole number in brackets is an index and stays in the name.
-
-    Examples
-    --------
-    >>> split_header("gyro_x [deg/h]")
-    ('gyro_x', 'deg/h')
-    >>> split_header("gyro_rad[0]")
-    ('gyro_rad[0]', None)
-    """
-    match = _BRACKET.match(text.strip())
-    if not match or (match.group(2).strip().isdigit() and match.group(2).strip() != "1"):
-        return text.strip(), None
-    if match.group(2).strip() == "1" and not re.search(r"\s\[", text):
-        return text.strip(), None  # "gyro_rad[1]" is an index, "ramp [1]" a unit
-    return match.group(1).strip(), match.group(2).strip()
-
-
 def plan_columns(
     path: Path,
     headers: Sequence[str],
@@ -124,6 +85,8 @@ def plan_columns(
     *,
     units: Mapping[int, str] | None = None,
     stamped: Collection[int] = (),
+    rising: Callable[[int], bool] | None = None,
+    presets: Mapping[int, str] | None = None,
 ) -> Plan:
     """Decide what each column is.
 
@@ -139,17 +102,22 @@ def plan_columns(
         Units that the format stores beside the header (NetCDF attributes).
     stamped : collection of int
         Columns whose values are dates already (ISO 8601 text, datetime types).
+    rising : callable, optional
+        Says of a column whether its first values rise; it decides between several columns that look like the time.
+    presets : mapping of int to str, optional
+        What columns are in files of a known program, in the form of ``--map``; what the user says is stronger.
 
     Returns
     -------
     Plan
         Nothing is raised here; ``Plan.check()`` raises what is wrong.
     """
-    work = _Work(path, options)
-    named = work.name(headers, units or {}, frozenset(stamped))
+    work = _Work(path, options, rising or (lambda source: True))
+    named = work.name(headers, units or {}, frozenset(stamped), presets or {})
+    named = work.separate(named)
     time = work.find_time(named)
     rest = [column for column in named if column is not time]
-    gyro = [column for column in rest if _AXIS.match(column.low)]
+    gyro = [column for column in rest if AXIS.match(column.low)]
     signal, kind = work.plan_gyro(gyro, headers)
     work.plan_channels([column for column in rest if column not in gyro])
     if time is None and options.rate is None and not work.problems:
@@ -166,53 +134,96 @@ def plan_columns(
 class _Work:
     """The lists that grow while a file's header is being understood."""
 
-    def __init__(self, path: Path, options: ReadOptions):
-        self.path, self.options = path, options
+    def __init__(self, path: Path, options: ReadOptions, rising: Callable[[int], bool]):
+        self.path, self.options, self.rising = path, options, rising
         self.columns: list[Column] = []
         self.summaries: list[ColumnSummary] = []
         self.notes: list[str] = []
         self.problems: list[GyrostabError] = []
         self.left_out: list[str] = []
+        self.unitless: list[tuple[str, str | None, str]] = []  # name, quantity, header
         self.used_map: set[str] = set()
         self.used_units: set[str] = set()
 
-    def name(self, headers: Sequence[str], units: Mapping[int, str], stamped: frozenset[int]) -> list[_Header]:
-        """Apply the map, drop what it drops, and refuse duplicates."""
+    def name(self, headers: Sequence[str], units: Mapping[int, str], stamped: frozenset[int], presets: Mapping[int, str]) -> list[Header]:
+        """Apply the map, then the preset, and drop what they drop."""
         wanted = {key.strip().lower(): key for key in self.options.map}
-        named: list[_Header] = []
-        for source, header in enumerate(headers):
-            name, unit = split_header(header)
-            key = next((wanted[text] for text in (header.strip().lower(), name.lower()) if text in wanted), None)
-            column = _Header(source, header.strip(), name, unit, units.get(source), stamped=source in stamped)
+        targets = {split_header(target)[0].lower() for target in self.options.map.values()}
+        named: list[Header] = []
+        for column in distinct_columns(headers):
+            source = column.source
+            column.stored, column.stamped = units.get(source), source in stamped
+            texts = (column.key.lower(), column.header.lower(), column.low)
+            key = next((wanted[text] for text in texts if text in wanted), None)
             if key is not None:
                 self.used_map.add(key)
                 target, target_unit = split_header(self.options.map[key])
                 if target in ("", "-"):
                     continue
                 column.name, column.unit, column.mapped = target, target_unit or column.unit, True
+            elif source in presets:
+                target, target_unit = split_header(presets[source])
+                if target == "-" or _is_taken(target.lower(), targets):
+                    self._leave_out(column)
+                    continue
+                column.name, column.preset = target, True
+                if target_unit is not None:  # weaker than --unit, stronger than a header that holds no unit
+                    column.unit, column.stored = None, target_unit
             if column.name:
                 named.append(column)
-        for low, count in Counter(c.low if _contract_name(c.low) else c.name for c in named).items():
-            if count > 1:
-                same = [f"{c.header!r}" for c in named if low in (c.low, c.name)]
-                text = f"{self.path.name}: {count} columns are called {low!r} ({', '.join(same)})"
-                self.problems.append(FormatError(f"{text}; rename them in the file or drop one with --map NAME=-"))
         return named
 
-    def find_time(self, named: list[_Header]) -> _Header | None:
-        """The one time column, with its unit."""
-        found = [c for c in named if c.low == "time" and c.mapped]
+    def separate(self, named: list[Header]) -> list[Header]:
+        """Give columns of one name names of their own; an axis must be one column."""
+        groups: dict[str, list[Header]] = {}
+        for column in named:
+            groups.setdefault(column.low if is_contract_name(column.low) else column.name, []).append(column)
+        taken, dropped = set(groups), set[int]()
+        renamed: list[str] = []
+        for name, same in groups.items():
+            asked = [column for column in same if column.mapped]
+            if len(same) == 1 or (name == "time" and len(asked) < 2):
+                continue
+            if len(asked) > 1 or (AXIS.match(name) and not asked):
+                headers = ", ".join(repr(column.header) for column in same[:5])
+                fix = f'drop the others, for instance --map "{(asked or same)[1].key}=-"'
+                self.problems.append(FormatError(f"{self.path.name}: {len(same)} columns are called {name!r} ({headers}); {fix}"))
+            elif AXIS.match(name):
+                others = [column for column in same if not column.mapped]
+                dropped.update(column.source for column in others)
+                self.notes.append(f"left out, as --map names another column {name}: {_listing([column.header for column in others])}")
+            else:
+                for number, column in enumerate(sorted(same, key=lambda column: not column.mapped)[1:], 2):
+                    column.name = free_name(f"{column.name}_", taken, number)
+                    taken.add(column.name)
+                    renamed.append(f"{column.header!r} is {column.name!r}")
+        if renamed:
+            more = f" and {len(renamed) - 5} more" if len(renamed) > 5 else ""
+            self.notes.append(f"columns of one name are kept apart: {', '.join(renamed[:5])}{more}")
+        return [column for column in named if column.source not in dropped]
+
+    def find_time(self, named: list[Header]) -> Header | None:
+        """The one time column, with its unit; others that look like it are left out with a note."""
+        found = [c for c in named if c.low == "time" and c.mapped] or [c for c in named if c.low == "time" and c.preset]
         if not found:
-            found = [c for c in named if not c.mapped and _TIME.match(c.low) and self._may_be_time(c)]
+            found = [c for c in named if not (c.mapped or c.preset) and TIME.match(c.low) and self._may_be_time(c)]
             sure = [c for c in found if c.low != "t" or c.unit or c.stored or c.stamped]
             found = sure or found
-        if len(found) > 1:
-            names = " and ".join(repr(c.header) for c in found)
-            fix = f'keep one and drop the other, for instance --map "{found[1].name}=-"'
-            self.problems.append(FormatError(f"{self.path.name}: {names} both look like the time column; {fix}"))
+        if not found:
+            found = [c for c in named if c.stamped and self.rising(c.source) and not (c.mapped or c.preset)]
+            if found:
+                self.notes.append(f"{found[0].header!r} is taken for the time column, as it holds dates")
         if not found:
             return None
+        found.sort(key=lambda c: not self.rising(c.source))
         column = found[0]
+        others = found[1:] + [c for c in named if c not in found and c.low == "time"]
+        if others:
+            names = " and ".join(repr(c.header) for c in [column, *others][:3])
+            self.notes.append(f'{names} look like the time; {column.header!r} is used (for another: --map "{others[0].key}=time")')
+            for other in others:
+                self._leave_out(other)
+                named.remove(other)
         unit = None if column.stamped else self._time_unit(column)
         self.columns.append(Column(column.source, column.header, "time", "time", "time", "ns", time_unit=unit))
         self._summarise(column, "time", "time", "time", unit.text if unit else "ISO 8601" if column.stamped else None)
@@ -221,20 +232,16 @@ class _Work:
         return column
 
     @staticmethod
-    def _may_be_time(column: _Header) -> bool:
+    def _may_be_time(column: Header) -> bool:
         written = column.unit or column.stored
-        if written is None:
-            return True
-        try:
-            parse_time_unit(written)
-        except GyrostabError:
-            return False
-        return True
+        return written is None or is_time_unit(written)
 
-    def _time_unit(self, column: _Header) -> TimeUnit | None:
-        suffix = _TIME.match(split_header(column.header)[0].lower())
-        written = column.unit or (suffix.group(1) if suffix and suffix.group(1) not in ("utc", "iso") else None)
-        text = self._unit_text(column, [column.name, column.header, "time"], written, prefer_given=column.unit is None)
+    def _time_unit(self, column: Header) -> TimeUnit | None:
+        suffix = TIME.match(split_header(column.header)[0].lower())
+        named = next((text for text in suffix.groups() if text), None) if suffix else None
+        written = column.unit or (named if named not in ("utc", "iso") and column.stored is None else None)
+        keys = [column.name, column.key, column.header, "time"]
+        text = self._unit_text(column, keys, written, is_time_unit, prefer_given=column.unit is None)
         if text is None:
             message = f"{self.path.name}: the time column {column.header!r} holds numbers and carries no unit"
             self.problems.append(MissingUnitError(f"{message}; give it with --unit time=s (or ms, us, ns)"))
@@ -245,12 +252,12 @@ class _Work:
             self.problems.append(UnitError(f"{self.path.name}: column {column.header!r}: {error}; give it with --unit time=s"))
             return None
 
-    def plan_gyro(self, gyro: list[_Header], headers: Sequence[str]) -> tuple[str | None, str | None]:
+    def plan_gyro(self, gyro: list[Header], headers: Sequence[str]) -> tuple[str | None, str | None]:
         """Units of the gyro axes, and whether they are rates, increments or cumulative angles."""
         if self.options.channels_only:
-            self.left_out.extend(c.header for c in gyro)
             for column in gyro:
-                self._summarise(column, column.name, "left out", None, column.unit)
+                self._leave_out(column)
+            self.left_out.extend(c.header for c in gyro)
             return None, None
         if not gyro:
             if not self.problems:
@@ -268,14 +275,17 @@ class _Work:
         if not quantities:
             return None, None
         signal = next(iter(quantities.values()))
-        return signal, self._kind(signal, next(iter(quantities)))
+        first = next(column for column in gyro if column.header in quantities)
+        return signal, self._kind(signal, first.header, first.key, first.low)
 
-    def _plan_axis(self, column: _Header) -> str | None:
-        match = _AXIS.match(column.low)
+    def _plan_axis(self, column: Header) -> str | None:
+        match = AXIS.match(column.low)
         assert match is not None
         stem, axis = match.groups()
         example = "deg/s" if stem == "gyro" else "deg"
-        text = self._unit_text(column, [column.low, column.header, stem], column.unit)
+        allowed = ("rate", "angle") if stem == "gyro" else ("angle",)
+        keys = [column.low, column.key, column.header, stem]
+        text = self._unit_text(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
         if text is None:
             message = f"{self.path.name}: the gyro column {column.header!r} carries no unit"
             how = f"give it with --unit {stem}={example} (all axes) or --unit {column.low}={example}"
@@ -283,7 +293,7 @@ class _Work:
             self._summarise(column, column.low, "gyro", None, None)
             return None
         try:
-            unit = parse_unit(text)
+            unit = parse_unit(text, next((quantity for quantity in allowed if is_unit_of(text, (quantity,))), None))
         except UnitError as error:
             if "factor" in str(error):
                 self.problems.append(UnitError(f"{self.path.name}: column {column.header!r}: {error}"))
@@ -292,7 +302,6 @@ class _Work:
             self.problems.append(UnitError(f"{self.path.name}: column {column.header!r}: unit {text!r} is not known; {hint}"))
             self._summarise(column, column.low, "gyro", None, text)
             return None
-        allowed = ("rate", "angle") if stem == "gyro" else ("angle",)
         if unit.quantity not in allowed:
             message = (
                 f"{self.path.name}: column {column.header!r} has the unit {text!r}, which is a unit of {unit.quantity}, not of {allowed[0]}"
@@ -306,11 +315,12 @@ class _Work:
         self._summarise(column, column.low, "gyro", unit.quantity, text)
         return unit.quantity
 
-    def _kind(self, signal: str, header: str) -> str | None:
+    def _kind(self, signal: str, header: str, key: str, name: str) -> str | None:
         if signal == "rate":
             if self.options.kind == "angle":
                 message = f"{self.path.name}: --kind angle, but column {header!r} is a rate"
-                self.problems.append(OptionError(f"{message}; leave --kind out, or correct the unit with --unit gyro=deg"))
+                fix = f'leave --kind out, or correct the unit with --map "{key}={name} [deg]"'
+                self.problems.append(OptionError(f"{message}; {fix}"))
             return "rate"
         if self.options.kind is None:
             message = f"{self.path.name}: column {header!r} is an angle, and nothing says of which kind"
@@ -318,85 +328,101 @@ class _Work:
             self.problems.append(OptionError(f"{message}; give {how}"))
         return "angle" if self.options.kind == "angle" else "increment"
 
-    def plan_channels(self, rest: list[_Header]) -> None:
-        """Channels: known names need a unit, others are kept when they carry one."""
+    def plan_channels(self, rest: list[Header]) -> None:
+        """Channels: what carries a unit is kept, the rest is left out with a note, or refused if it was asked for."""
         for column in rest:
-            known = bool(_KNOWN.match(column.low))
-            stem = column.low.split("_")[0]
-            quantity = _QUANTITIES.get(column.low) or _QUANTITIES.get(stem)
-            if quantity is None:
-                quantity = next((q for name, q in _QUANTITIES.items() if column.low.startswith(name + "_")), None)
+            quantity = quantity_of(column.low)
+            known = bool(KNOWN.match(column.low))
             name = column.low if known or quantity else re.sub(r"[/\s]+", "_", column.name)
-            keys = [name, column.name, column.header] + ([stem] if quantity else [])
-            text = self._unit_text(column, keys, column.unit)
+            keys = [name, column.name, column.key, column.header, *([column.low.split("_")[0]] if quantity else [])]
+            usable = partial(is_unit_of, quantities=(unit_quantity(quantity),)) if quantity else is_unit
+            text = self._unit_text(column, keys, column.unit, usable)
             if column.low == "ramp" and text is None:
                 text = "1"  # any scale will do
-            if text is None and (known or column.mapped):
-                example = (
-                    known_units(quantity).split(",")[0] if quantity and quantity != "rotation_rate" else "deg/s" if quantity else "UNIT"
-                )
-                message = f"{self.path.name}: column {column.header!r} carries no unit; give it with --unit {name}={example}"
-                self.problems.append(MissingUnitError(f'{message}, or drop the column with --map "{column.header}=-"'))
+            asked = (
+                column.mapped or any(key.lower() in _lowered(self.options.unit) for key in keys) or (known and self.options.channels_only)
+            )
+            if text is None and asked:
+                message = f"{self.path.name}: column {column.header!r} carries no unit; give it with --unit {name}={example_unit(quantity)}"
+                self.problems.append(MissingUnitError(f'{message}, or drop the column with --map "{column.key}=-"'))
             if text is None:
-                self.left_out.append(column.header)
-                self._summarise(column, name, "left out", None, None)
+                self.unitless.append((name, quantity, column.header))
+                self._leave_out(column)
                 continue
-            self._plan_channel(column, name, quantity, text, strict=known)
+            self._plan_channel(column, name, quantity, text, known=known, asked=asked)
 
-    def _plan_channel(self, column: _Header, name: str, quantity: str | None, text: str, *, strict: bool) -> None:
+    def _plan_channel(self, column: Header, name: str, quantity: str | None, text: str, *, known: bool, asked: bool) -> None:
         factor, offset, units = 1.0, 0.0, text
         if quantity is not None:
-            expected = "rate" if quantity == "rotation_rate" else quantity
-            try:
-                unit = parse_unit(text)
-                fits = unit.quantity == expected
-            except UnitError:
-                fits = False
-            if fits:
+            expected = unit_quantity(quantity)
+            if is_unit_of(text, (expected,)):
+                unit = parse_unit(text, expected)
                 scale = 1.0 / 3600.0 if quantity == "rotation_rate" else 1.0
                 factor, offset, units = unit.factor * scale, unit.offset, INNER[quantity]
             elif quantity == "number":
                 units = INNER["number"]
-            elif strict:
-                message = f"{self.path.name}: column {column.header!r}: {text!r} is no known unit of {expected}"
-                how = f"known are {known_units(expected)}; give it with --unit {name}=UNIT"
-                self.problems.append(UnitError(f'{message}; {how}, or drop the column with --map "{column.header}=-"'))
+            elif known:
+                message = f"column {column.header!r}: {text!r} is no known unit of {expected}"
+                how = f"known are {known_units(expected)}; give it with --unit {name}={example_unit(quantity)}"
+                if not asked:
+                    self.notes.append(f"{message}, so it is left out; {how}")
+                    self._leave_out(column)
+                    return
+                fix = f'{how}, or drop the column with --map "{column.key}=-"'
+                self.problems.append(UnitError(f"{self.path.name}: {message}; {fix}"))
             else:
                 quantity = None
         self.columns.append(Column(column.source, column.header, "channel", name, quantity or "other", units, factor, offset))
         self._summarise(column, name, "channel", quantity or "other", text)
 
-    def _unit_text(self, column: _Header, keys: list[str], written: str | None, *, prefer_given: bool = False) -> str | None:
-        lows = [key.lower() for key in keys]
-        given = {key.lower(): key for key in self.options.unit}
-        key = next((given[low] for low in lows if low in given), None)
+    def _unit_text(
+        self, column: Header, keys: list[str], written: str | None, usable: Callable[[str], bool], *, prefer_given: bool = False
+    ) -> str | None:
+        """The unit of a column: that of the header, unless it is none and the user gave one."""
+        given = _lowered(self.options.unit)
+        key = next((given[low] for low in map(str.lower, keys) if low in given), None)
         if key is None:
             return written or column.stored
         self.used_units.add(key)
         text = self.options.unit[key]
         if written is None or prefer_given or written == text:
             return text
+        if not usable(written):
+            self.notes.append(f"column {column.header!r} says [{written}], which is no usable unit; it is read by --unit {key}={text}")
+            return text
         note = f"column {column.header!r} says [{written}], so --unit {key}={text} is not applied to it"
-        self.notes.append(f'{note}; to overrule the header give --map "{column.header}={column.low} [{text}]"')
+        self.notes.append(f'{note}; to overrule the header give --map "{column.key}={column.low} [{text}]"')
         return written
 
-    def _summarise(self, column: _Header, name: str, role: str, quantity: str | None, unit: str | None) -> None:
-        self.summaries.append(ColumnSummary(column.header, name, role, quantity, unit))
+    def _leave_out(self, column: Header) -> None:
+        self._summarise(column, column.name, "left out", None, column.unit or column.stored)
+
+    def _summarise(self, column: Header, name: str, role: str, quantity: str | None, unit: str | None) -> None:
+        self.summaries.append(ColumnSummary(column.header, name, role, quantity, unit, column.key))
 
     def finish(self, headers: Sequence[str]) -> None:
         """Notes on what was left out, summaries in the order of the file."""
+        if self.unitless:
+            name, quantity, _ = min(self.unitless, key=lambda entry: entry[1] is None)  # one of a known quantity first
+            how = f"keep one with a unit: --unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
+            self.notes.append(f"left out, as they carry no unit: {_listing([header for _, _, header in self.unitless])} ({how})")
         if self.left_out:
-            self.notes.append(f"left out, as they carry no unit and no known name: {_listing(self.left_out)}")
+            self.notes.append(f"left out, as the file is read for its channels: {_listing(self.left_out)}")
         place = {header.strip(): index for index, header in enumerate(headers)}
         self.summaries.sort(key=lambda summary: place.get(summary.header, -1))
 
 
+def _is_taken(target: str, asked: set[str]) -> bool:
+    """Whether the user has named a column for what a preset has another one for; axes are named all together."""
+    return target in asked or (bool(AXIS.match(target)) and any(AXIS.match(name) for name in asked))
+
+
+def _lowered(names: Mapping[str, str]) -> dict[str, str]:
+    return {name.lower(): name for name in names}
+
+
 def _arcsec(stem: str) -> str:
     return "arcsec/s" if stem == "gyro" else "arcsec"
-
-
-def _contract_name(low: str) -> bool:
-    return bool(_AXIS.match(low) or _KNOWN.match(low) or low == "time")
 
 
 def _listing(names: Sequence[str], most: int = 30) -> str:
@@ -405,12 +431,13 @@ def _listing(names: Sequence[str], most: int = 30) -> str:
 
 
 def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
-    names = [split_header(header)[0] for header in headers if header.strip()]
-    free = [name for name in names if not _TIME.match(name.lower()) and name.lower().split("_")[0] not in _QUANTITIES]
-    likely = next((name for pattern in _LOOKS_GYRO for name in free if pattern.search(name)), free[0] if free else "NAME")
-    low = next((header for header in headers if likely in header), likely).lower()
-    hour = re.search(r"deg_?(per_?|/)?h|dph", low)
-    unit = "deg/h" if hour else "rad/s" if "rad" in low else "deg/s"
-    given = "" if split_header(next((h for h in headers if likely in h), ""))[1] else f" --unit gyro={unit}"
-    message = f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: {_listing(names, 100)}"
-    return FormatError(f'{message}. Say which they are, for instance: --map "{likely}=gyro_x"{given}')
+    columns = [column for column in distinct_columns(headers) if column.header]
+    free = [c for c in columns if not TIME.match(c.low) and quantity_of(c.low) is None]
+    looks = (c for pattern in LOOKS_GYRO for c in free if pattern.search(c.name))
+    likely = next(looks, free[0] if free else None)
+    low = likely.header.lower() if likely else ""
+    unit = "deg/h" if re.search(r"deg_?(per_?|/)?h|dph", low) else "rad/s" if "rad" in low else "deg/s"
+    given = "" if likely and likely.unit and is_unit_of(likely.unit, ("rate", "angle")) else f" --unit gyro={unit}"
+    message = f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: {_listing([c.name for c in columns], 100)}"
+    how = f'Say which they are, for instance: --map "{likely.key if likely else "NAME"}=gyro_x"{given}'
+    return FormatError(f"{message}. {how}; gyrostab scan {shlex.quote(path.name)} looks into each column")

@@ -91,6 +91,7 @@ class ColumnSummary:
     role: str  # "time", "gyro", "channel" or "left out"
     quantity: str | None
     unit: str | None
+    key: str = ""  # what --map calls it
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from gyrostab.read.columns import Column, Plan, plan_columns
 from gyrostab.read.intake import Intake, Taken, summary_of
 from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line
 from gyrostab.read.options import FileSummary, ReadOptions
-from gyrostab.read.stamps import cells_to_ns, looks_iso
+from gyrostab.read.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
 from gyrostab.threads import in_order
 
 __all__ = ["matches", "read", "scan"]
@@ -90,7 +90,18 @@ def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
     stamped = [
         column for column in range(layout.width) if any(looks_iso(row[column]) for row in layout.samples if len(row) == layout.width)
     ]
-    return layout, plan_columns(path, layout.headers, options, stamped=stamped)
+    return layout, plan_columns(path, layout.headers, options, stamped=stamped, rising=partial(_rises, layout))
+
+
+def _rises(layout: Layout, column: int) -> bool:
+    """Whether the first cells of a column that hold something rise from row to row."""
+    cells = [row[column] for row in layout.samples if len(row) == layout.width and row[column].strip()]
+    if all(is_number(cell, comma=layout.decimal_comma) for cell in cells):
+        steps = np.diff([float(cell.replace(",", ".")) for cell in cells])
+    else:
+        stamps = texts_to_ns(cells)
+        steps = np.diff(stamps[stamps != NAT])
+    return bool(len(steps) and (steps >= 0).all() and steps.any())
 
 
 def _stamps(layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions) -> NDArray[np.int64]:

@@ -1,0 +1,169 @@
+"""Columns as other programs name them: units in parentheses, names twice, channels without a unit, several times."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.errors import GyrostabError, MissingUnitError, UnitError
+from gyrostab.read import read_log
+from gyrostab.read.headers import split_header
+
+
+def write(folder: Path, text: str, name: str = "log.csv") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def seconds(raw: xr.Dataset) -> list[float]:
+    return (raw.time.values.astype("datetime64[ns]").view(np.int64) / 1e9).tolist()
+
+
+def has_note(raw: xr.Dataset, *words: str) -> bool:
+    return any(all(word in note for word in words) for note in raw.attrs["notes"])
+
+
+@pytest.mark.parametrize(
+    ("header", "split"),
+    [
+        ("Gyroscope x (deg/s)", ("Gyroscope x", "deg/s")),
+        ("Time (s)", ("Time", "s")),
+        ("Temp(°C)", ("Temp", "°C")),
+        ("GX [DEG/HR]", ("GX", "DEG/HR")),
+        ("Acceleration x (m/s^2)", ("Acceleration x", "m/s^2")),
+        ("supply (raw)", ("supply (raw)", None)),
+        ("column (2)", ("column (2)", None)),
+        ("gyro_rad[1]", ("gyro_rad[1]", None)),
+    ],
+)
+def test_units_in_brackets_and_parentheses(header: str, split: tuple[str, str | None]) -> None:
+    assert split_header(header) == split
+
+
+def test_a_header_with_parentheses_needs_no_units_from_the_user(tmp_path: Path) -> None:
+    path = write(tmp_path, "Time (s),GX (DEG/HR),Temperature (Celsius)\n0,1,20\n1,2,21\n")
+    raw = read_log(path, map={"GX": "gyro_x"})
+    assert seconds(raw) == [0, 1]
+    assert raw.rate[0].values.tolist() == [1, 2]
+    assert raw.temperature.values.tolist() == [20, 21]
+
+
+@pytest.mark.parametrize("header", ["temperature", "temperature [furlong]", "temperature [x8103]", "mag_x", "pressure [V]", "accel_z"])
+def test_a_channel_that_nobody_asked_for_stops_no_run(tmp_path: Path, header: str) -> None:
+    path = write(tmp_path, f"time [s],gyro_x [deg/h],{header}\n0,1,2\n1,2,3\n")
+    raw = read_log(path)
+    assert list(raw.data_vars) == ["rate"]
+    assert has_note(raw, "left out", header)
+
+
+@pytest.mark.parametrize(("header", "unit"), [("temperature", "degC"), ("temperature [furlong]", "degC"), ("pressure [x8103]", "Pa")])
+def test_a_note_says_how_to_keep_a_channel_and_that_works(tmp_path: Path, header: str, unit: str) -> None:
+    path = write(tmp_path, f"time [s],gyro_x [deg/h],{header}\n0,1,2\n1,2,3\n")
+    name = header.split(" ")[0]
+    advice = next(found[1] for note in read_log(path).attrs["notes"] if (found := re.search(r"--unit (\S+?=[^\s,;)]+)", note)))
+    assert advice.startswith(f"{name}=")
+    key, _, value = advice.partition("=")
+    kept = read_log(path, unit={key: unit if value == "UNIT" else value})
+    assert kept[name].values.tolist() == [2, 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [
+        ("time [s],gyro_x\n0,1\n1,2\n", {}),
+        ("time [s],gyro_x [furlong]\n0,1\n1,2\n", {}),
+        ("time [s],gyro_x [degC]\n0,1\n1,2\n", {}),
+        ("time,gyro_x [deg/h]\n0,1\n1,2\n", {}),
+        ("tick [x800E],gyro_x [deg/h]\n0,1\n1,2\n", {"map": {"tick": "time"}}),
+        ("time [s],wx,wy\n0,1,2\n1,2,3\n", {}),
+        ("time [s],wx (raw),wy (raw)\n0,1,2\n1,2,3\n", {}),
+        ("time [s],wx [V],wy [V]\n0,1,2\n1,2,3\n", {}),
+        ("time [s],gyro_x [deg/h],gyro_x [deg/h]\n0,1,1\n1,2,1\n", {}),
+        ("time [s],gyro_x [deg/h],Gyro_X [deg/s]\n0,1,1\n1,2,1\n", {}),
+        ("time [s],gyro_x [deg/h],T\n0,1,1\n1,2,1\n", {"map": {"T": "temperature"}}),
+        ("time [s],gyro_x [deg/h],T [V]\n0,1,1\n1,2,1\n", {"map": {"T": "temperature"}}),
+        ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"kind": "angle"}),
+    ],
+)
+def test_the_advice_of_a_message_works_when_it_is_followed(tmp_path: Path, text: str, options: dict) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(GyrostabError) as caught:
+        read_log(path, **options)
+    options = {"map": dict(options.get("map", {})), "unit": {}, "kind": options.get("kind")}
+    words = shlex.split(str(caught.value).replace("'", "").partition("; gyrostab scan")[0])
+    for option in ("map", "unit"):
+        for at, word in enumerate(words[:-1]):
+            if word == f"--{option}" and "NAME" not in words[at + 1]:
+                key, _, value = words[at + 1].rstrip(",;").partition("=")
+                if "UNIT" not in value:
+                    options[option].setdefault(key, value)
+                break  # the first advice is enough
+    if "UNIT" in str(caught.value) and not options["unit"]:
+        options["unit"] = {"temperature": "degC"}
+    assert read_log(path, **options).sizes["row"] == 2
+
+
+def test_a_unit_from_the_user_wins_over_a_header_that_holds_none(tmp_path: Path) -> None:
+    path = write(tmp_path, "time [s],gyro_x [x8005],temperature [x8014]\n0,1,20\n1,2,21\n")
+    raw = read_log(path, unit={"gyro": "deg/s", "temperature": "degC"})
+    assert raw.rate[0].values.tolist() == [3600, 7200]
+    assert raw.temperature.values.tolist() == [20, 21]
+    assert has_note(raw, "gyro_x [x8005]", "--unit gyro=deg/s")
+
+
+def test_a_channel_that_was_asked_for_is_an_error_without_a_unit(tmp_path: Path) -> None:
+    path = write(tmp_path, "time [s],gyro_x [deg/h],T\n0,1,2\n1,2,3\n")
+    probe = write(tmp_path, "time [s],temperature\n0,1\n1,2\n", "probe.csv")
+    with pytest.raises(MissingUnitError, match="'T' carries no unit"):
+        read_log(path, map={"T": "temperature"})
+    with pytest.raises(UnitError, match="no known unit of temperature"):
+        read_log(path, map={"T": "temperature"}, unit={"temperature": "V"})
+    with pytest.raises(MissingUnitError, match="'temperature' carries no unit"):
+        read_log(path, channel=probe)
+
+
+def test_columns_of_one_name_are_kept_apart(tmp_path: Path) -> None:
+    header = "time [s],gyro_x [deg/h],Flags [x8103],Flags [x8108],temperature [degC],temperature [degF],load [%],load [%]"
+    path = write(tmp_path, header + "\n0,1,3,4,20,68,5,6\n1,2,3,4,20,68,5,6\n")
+    raw = read_log(path)
+    expected = {"Flags": 3, "Flags_2": 4, "temperature": 20, "temperature_2": 20, "load": 5, "load_2": 6}
+    assert {name: float(raw[name][0]) for name in raw.data_vars if name != "rate"} == pytest.approx(expected)
+    assert has_note(raw, "kept apart", "'Flags [x8108]' is 'Flags_2'")
+    assert "load_2" not in read_log(path, map={"load_2": "-"})
+    assert "Flags_2" not in read_log(path, map={"Flags [x8108]": "-"})
+
+
+def test_a_mapped_axis_wins_over_a_column_of_its_name(tmp_path: Path) -> None:
+    path = write(tmp_path, "time [s],gyro_x [deg/h],raw_x [deg/h]\n0,1,5\n1,2,6\n")
+    raw = read_log(path, map={"raw_x": "gyro_x"})
+    assert raw.rate[0].values.tolist() == [5, 6]
+    assert has_note(raw, "left out", "gyro_x [deg/h]")
+
+
+@pytest.mark.parametrize(
+    ("text", "used", "stamps"),
+    [
+        ("time [s],timestamp [us],gyro_x [deg/h]\n0,0,1\n1,1000000,2\n", "time [s]", [0, 1]),
+        ("time [s],timestamp [us],gyro_x [deg/h]\n0,0,1\n0,1000000,2\n", "timestamp [us]", [0, 1]),
+        ("Time [s],time (ms),gyro_x [deg/h]\n7,0,1\n6,1000,2\n", "time (ms)", [0, 1]),
+        ("time,timestamp [ms],gyro_x [deg/h]\n1970-01-01T00:00:03,0,1\n1970-01-01T00:00:04,1000,2\n", "time", [3, 4]),
+        ("n,When,gyro_x [deg/h]\n7,1970-01-01T00:00:03,1\n8,1970-01-01T00:00:04,2\n", "When", [3, 4]),
+    ],
+)
+def test_the_time_column_is_chosen_and_named(tmp_path: Path, text: str, used: str, stamps: list[float]) -> None:
+    raw = read_log(write(tmp_path, text))
+    assert seconds(raw) == stamps
+    assert has_note(raw, f"{used!r}", "time")
+    assert list(raw.data_vars) == ["rate"]
+
+
+def test_another_time_column_can_be_named(tmp_path: Path) -> None:
+    path = write(tmp_path, "Time [s],Time::TimeStartup [ns],gyro_x [deg/h]\n0,0,1\n1,2000000000,2\n")
+    assert seconds(read_log(path)) == [0, 1]
+    assert seconds(read_log(path, map={"Time::TimeStartup": "time"})) == [0, 2]
