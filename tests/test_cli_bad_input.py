@@ -94,7 +94,6 @@ BAD_INPUT = {
     "header only": (_bad_text(b"time [s],gyro_x [deg/h]\n"), "no data row"),
     "no unit": (_bad_log(header="time [s],gyro_x,gyro_y"), "--unit"),
     "unknown unit": (_bad_log(header="time [s],gyro_x [furlong/h],gyro_y [deg/h]"), "furlong/h"),
-    "two time columns": (_bad_log(header="time [s],time [ms],gyro_y [deg/h]"), "time"),
     "time going backwards": (_bad_log(change=lambda rows: rows[::-1]), "time"),
     "all NaN": (_bad_log(change=_no_gyro), "unreadable"),
     "one sample": (_bad_log(seconds=0.01), "."),
