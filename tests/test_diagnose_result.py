@@ -260,7 +260,7 @@ def test_the_page_says_what_where_when_how_much_how_sure_what_else_and_what_next
         "Noise that rises with vibration, axis x",
         "25:00 to 30:00 after the start",
         "1.8 times the expected one",
-        "1 of 2 500 such records",
+        "1 of 2 500",
         "0.00045",
         "31 ± 6 nats",
         "a bias that follows acceleration (g_sensitivity)",

@@ -378,4 +378,5 @@ class RealMotion(Effect):
         if self.spin:
             terms.append(f"{self.quantity('spin', errors)} of {self.channel_names()['rotation_rate']}")
         terms += [f"tilt {self.quantity(name, errors)} along {name}" for name in "xyz" if getattr(self, name)]
-        return f"The tool really rotates {self.on_axes()}, with shares {self.quantity('direction')}: {', '.join(terms) or 'not at all'}."
+        shares = f", with shares {self.quantity('direction')}" if len(self.direction) > 1 else ""
+        return f"The tool really rotates {self.on_axes()}{shares}: {', '.join(terms) or 'not at all'}."

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 
 from gyrostab.diagnose.conclusion.result import Diagnosis, check_diagnosis
-from gyrostab.diagnose.conclusion.sentences import axes_text, length_text, next_measurement, plain_name, summary
+from gyrostab.diagnose.conclusion.sentences import (
+    axes_text,
+    chance_share,
+    length_text,
+    next_measurement,
+    plain_name,
+    summary,
+    without_chance,
+)
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
 from gyrostab.plot.style import embedded
@@ -146,7 +154,8 @@ def _mismatch(box: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, A
     return {
         "id": box["id"],
         "view": _VIEWS[box["view"]],
-        "statement": box["statement"],
+        "statement": without_chance(box["statement"]),
+        "chance": chance_share(box["p_value"]),
         "explained": "; ".join(plain_name(name) for name in box["explained_by"])
         or ("not explained" if box["id"] in content["unexplained"] else "–"),
     }

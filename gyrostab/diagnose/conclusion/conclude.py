@@ -23,11 +23,12 @@ from gyrostab.diagnose.conclusion.content import (
     recording_table,
     surfaces_with_blocks,
     unknown_tables,
-    verdict,
 )
 from gyrostab.diagnose.conclusion.evidence import held_out
+from gyrostab.diagnose.conclusion.gate import with_supported_claims
 from gyrostab.diagnose.conclusion.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
 from gyrostab.diagnose.conclusion.surfaces import make_surfaces
+from gyrostab.diagnose.conclusion.verdict import decide_verdict
 from gyrostab.diagnose.effects.explained import without_odd
 from gyrostab.diagnose.modelling.expected_effects import expected_baseline, fit_expected
 from gyrostab.diagnose.modelling.limits import limits
@@ -42,7 +43,7 @@ from gyrostab.diagnose.naming.waves import without_waves
 from gyrostab.diagnose.task import Compared, Task, still_lines
 from gyrostab.simulate.model import Model
 
-__all__ = ["Fit", "conclude", "fitted_beside_their_noise", "worth"]
+__all__ = ["Fit", "conclude", "fit_supported", "fitted_beside_their_noise", "worth"]
 
 
 class Fit(NamedTuple):
@@ -66,9 +67,8 @@ class Fit(NamedTuple):
 
 def conclude(task: Task, compared: Compared, begun: float) -> Diagnosis:
     """Fit what was named, see what it is worth and what is left, and put it all into one result."""
-    reduced, baseline, naming = compared.reduced, compared.baseline, compared.naming
-    first = fit_claims(naming, baseline)
-    fit = fitted_beside_their_noise(naming, baseline, first)
+    reduced, baseline = compared.reduced, compared.baseline
+    naming, first, fit = fit_supported(compared.naming, baseline)
     before = expected_baseline(fit.naming, baseline)
     after = predicted(fit.naming, fit.noise) if naming.claims else before
     mismatches = _mismatches(task, compared, fit, after)
@@ -78,7 +78,7 @@ def conclude(task: Task, compared: Compared, begun: float) -> Diagnosis:
         "schema": SCHEMA,
         "recording": recording_table(reduced),
         "baseline": baseline_table(baseline, fit.expected),
-        "verdict": verdict(mismatches, fit.naming.claims, unexplained),
+        "verdict": decide_verdict(mismatches, fit.naming.claims, unexplained, held),
         "false_alarm_level": task.level,
         "mismatches": mismatches,
         "effects": effect_tables(fit.fitted, reduced),
@@ -91,6 +91,28 @@ def conclude(task: Task, compared: Compared, begun: float) -> Diagnosis:
     diagnosis = Diagnosis(plain(content), _surfaces(reduced, fit, before, after), model_tables(fit.noise, fit.fitted, own))
     check_diagnosis(diagnosis.content)
     return diagnosis
+
+
+def fit_supported(naming: Naming, baseline: xr.Dataset) -> tuple[Naming, list[Fitted], Fit]:
+    """Fit the effects until each that is left has a size away from zero.
+
+    Returns
+    -------
+    naming : Naming
+        Without the effects whose size may be zero.
+    first : list of Fitted
+        Their numbers beside the noise of `baseline`.
+    fit : Fit
+        Their numbers beside the noise that they leave.
+    """
+    while True:
+        first = fit_claims(naming, baseline)
+        fit = fitted_beside_their_noise(naming, baseline, first)
+        numbers = [[one for one in fit.fitted if one.claim is claim] for claim in fit.naming.claims]
+        kept = with_supported_claims(naming, numbers)
+        if kept is naming:
+            return naming, first, fit
+        naming = kept
 
 
 def fitted_beside_their_noise(naming: Naming, baseline: xr.Dataset, first: list[Fitted]) -> Fit:

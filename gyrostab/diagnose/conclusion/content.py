@@ -22,6 +22,7 @@ from gyrostab.diagnose.conclusion.sentences import (
     named_statement,
     plain_name,
     span_text,
+    unsized_statement,
 )
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.effects.generics import GENERICS
@@ -46,7 +47,6 @@ __all__ = [
     "recording_table",
     "surfaces_with_blocks",
     "unknown_tables",
-    "verdict",
 ]
 
 Array = NDArray[np.float64]
@@ -96,7 +96,10 @@ def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str
             value, error = (float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr"))
             noise[str(axis)][str(term)] = {"value": value, "stderr": error if math.isfinite(error) else None, "unit": LAWS[str(term)].label}
     spans = baseline.attrs.get("calibrated_on", [])
-    known = [{"name": one.claim.effect, "axes": list(one.axes), "statement": one.say()} for one in expected]
+    known = [
+        {"name": one.claim.effect, "axes": list(one.axes), "statement": one.say() or unsized_statement(one.claim.effect, one.axes)}
+        for one in expected
+    ]
     table = {"source": baseline.attrs["source"], "noise": noise, "calibrated_on": [list(span) for span in spans]}
     return {**table, "expected": known} if known else table
 
@@ -280,7 +283,7 @@ def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[st
                 "held_out_gain": {"nats": claim.gain, "stderr": math.sqrt(2.0 * max(claim.gain, 0.0)), "threshold": claim.threshold},
                 "alternatives": list(claim.alternatives),
                 "statement": effect_statement(
-                    one.say(),
+                    one.say() or unsized_statement(claim.effect, one.axes),
                     alternatives=claim.alternatives,
                     intervals=[] if when == [(float(begin[0]), whole)] else [span_text(*span, whole) for span in when],
                 ),
@@ -310,13 +313,6 @@ def model_tables(baseline: xr.Dataset, fitted: Sequence[Fitted], own: Model | No
 def _instrument(effect: Effect) -> int:
     """Samples of the instrument in one of the log that an effect needs: a filter works at the rate of the instrument."""
     return int(getattr(effect, "instrument", 1)) or _FAST
-
-
-def verdict(mismatches: Sequence[Mapping[str, Any]], claims: Sequence[Claim], unexplained: Sequence[int]) -> str:
-    """One of `gyrostab.diagnose.conclusion.result.VERDICTS`."""
-    if not claims:
-        return "unknown" if mismatches else "no mismatch"
-    return "partly explained" if unexplained else "explained"
 
 
 def surfaces_with_blocks(surfaces: xr.Dataset, reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:

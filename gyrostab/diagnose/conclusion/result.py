@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.conclusion.sentences import next_measurement, summary
+from gyrostab.diagnose.conclusion.sentences import chance_share, next_measurement, summary, without_chance
 from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import Effect
@@ -71,7 +71,11 @@ class Diagnosis:
             if step := next_measurement(effect["name"], effect["alternatives"]):
                 lines.append(f"  {step}")
         left = set(self.content["unexplained"])
-        lines += [f"- unexplained: {box['statement']}" for box in self.mismatches if box["id"] in left]
+        boxes = [box for box in self.mismatches if box["id"] in left]
+        lines += [f"- unexplained: {without_chance(box['statement']) if len(boxes) > 1 else box['statement']}" for box in boxes]
+        if len(boxes) > 1:
+            likeliest = max(box["p_value"] for box in boxes)
+            lines.append(f"  Noise alone does as much as the least certain of these in {chance_share(likeliest)} such records.")
         return "\n".join(lines)
 
 

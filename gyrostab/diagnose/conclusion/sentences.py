@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from gyrostab.diagnose.conclusion.verdict import failed_checks
 from gyrostab.physics.registry import effects
 
 __all__ = [
     "axes_text",
     "chance",
+    "chance_share",
     "clock",
     "effect_statement",
     "length_text",
@@ -23,9 +26,12 @@ __all__ = [
     "plain_name",
     "span_text",
     "summary",
+    "unsized_statement",
+    "without_chance",
 ]
 
 _SURE = 1e-6  # chances below that are not told apart
+_CHANCE_WORDS = re.compile(r" \(noise alone does that in [^()]*\)(?=\.$)")
 
 #: What each effect is called in a sentence.
 _NAMES = {
@@ -134,14 +140,21 @@ def chance(p_value: float) -> str:
     >>> chance(0.004), chance(1e-12)
     ('noise alone does that in 1 of 250 such records', 'noise alone does that in fewer than 1 of a million such records')
     """
+    return f"noise alone does that in {chance_share(p_value)} such records"
+
+
+def chance_share(p_value: float) -> str:
+    """Give a probability as one in so many, never smaller than the null records can tell.
+
+    Examples
+    --------
+    >>> chance_share(0.004), chance_share(0.03), chance_share(1e-12)
+    ('1 of 250', '1 of 33', 'fewer than 1 of a million')
+    """
     if p_value < _SURE:
-        return "noise alone does that in fewer than 1 of a million such records"
+        return "fewer than 1 of a million"
     number = 1.0 / p_value
-    return (
-        f"noise alone does that in 1 of {number:.2g} such records"
-        if number < 100
-        else f"noise alone does that in 1 of {_round(number)} such records"
-    )
+    return f"1 of {number:.2g}" if number < 100 else f"1 of {_round(number)}"
 
 
 def _round(number: float) -> str:
@@ -299,6 +312,28 @@ _MARKS = {
 }
 
 
+def unsized_statement(effect: str, axes: Sequence[str]) -> str:
+    """Say that the record shows an effect whose size it does not give.
+
+    Examples
+    --------
+    >>> unsized_statement("real_motion", ["z"])
+    'The record shows real rotation of the tool, not a sensor error, on axis z. It does not give a size.'
+    """
+    return f"The record shows {plain_name(effect)}, on {axes_text(axes)}. It does not give a size."
+
+
+def without_chance(statement: str) -> str:
+    """Return a statement on a mismatch without its closing words on chance, for lists that show the chance elsewhere.
+
+    Examples
+    --------
+    >>> without_chance("Axis x is noisier than simulated (noise alone does that in 1 of 250 such records).")
+    'Axis x is noisier than simulated.'
+    """
+    return _CHANCE_WORDS.sub("", statement)
+
+
 def next_measurement(name: str, alternatives: Sequence[str]) -> str:
     """What to measure to tell an effect from those that the record cannot tell it from; empty when nothing is known.
 
@@ -349,10 +384,22 @@ def summary(content: Mapping[str, Any]) -> str:
     if content["verdict"] == "no mismatch":
         level = 100.0 * content["false_alarm_level"]
         return f"On {axes} nothing differs from the simulation by more than noise does (chance of a false alarm: {level:g} %)."
-    places = f"{found} place{'s' if found != 1 else ''} where the recording differs from the simulation"
-    names = "; ".join(f"{plain_name(effect['name'])}, on {axes_text(effect['axes'])}" for effect in named)
-    if content["verdict"] == "explained":
-        return f"There {'is' if found == 1 else 'are'} {places}. What explains {'it' if found == 1 else 'them'}: {names}."
-    if content["verdict"] == "partly explained":
-        return f"There are {places}. Part of them is explained: {names}. {len(left)} of them {'is' if len(left) == 1 else 'are'} not."
-    return f"There {'is' if found == 1 else 'are'} {places}; none of the known effects explains {'it' if found == 1 else 'them'}."
+    are, them = ("is", "it") if found == 1 else ("are", "them")
+    places = f"{found} place{'' if found == 1 else 's'} where the recording differs from the simulation"
+    if not named:
+        return f"There {are} {places}; none of the known effects explains {them}."
+    names, failed = _named_text(named), failed_checks(content["held_out"])
+    but = f" The named effects do not describe the record well: {'; '.join(failed)}." if failed else ""
+    if content["verdict"] == "unknown":
+        return f"There {are} {places}. What was named does not explain {them}: {names}.{but}"
+    if not left:
+        return f"There {are} {places}. What explains {them}: {names}.{but}"
+    rest = f"{len(left)} of them {'is' if len(left) == 1 else 'are'} not."
+    return f"There {are} {places}. Part of {them} is explained: {names}. {rest}{but}"
+
+
+def _named_text(named: Sequence[Mapping[str, Any]]) -> str:
+    """List the named effects, each once for the axes that it acts on."""
+    texts = [f"{plain_name(effect['name'])}, on {axes_text(effect['axes'])}" for effect in named]
+    counts = {text: texts.count(text) for text in texts}
+    return "; ".join(text if count == 1 else f"{text} ({count} times)" for text, count in counts.items())

@@ -91,6 +91,8 @@ def _of_row(part: Part, family: Sequence[Variant], state: State) -> float:
         return math.nan
     mean, sd = np.array([moments[place] for place in usable]).T
     evidence = np.array([float(np.logaddexp.reduce(sizes[place].log_weight)) for place in usable]) - np.log(sd)
+    if not np.isfinite(evidence).any():
+        return math.nan
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
     one_sided = part.variant.squared and part.candidate.view == "power"  # a product of two axes has either sign
     size = np.maximum(mean, 0.0) if one_sided else np.abs(mean)

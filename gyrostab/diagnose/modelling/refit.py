@@ -81,9 +81,9 @@ class Fitted:
     note: str = ""
 
     def say(self) -> str:
-        """One sentence in plain words."""
+        """Describe the effect with its numbers in one sentence; return an empty string where it has no numbers."""
         if self.effect is None or not self.parameters:
-            return f"{effects()[self.claim.effect].short} (on {', '.join(self.axes)})."
+            return ""
         said = self.effect.say({name: one.stderr for name, one in self.parameters.items()})
         return f"{said} {self.note}" if self.note else said
 
