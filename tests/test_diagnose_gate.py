@@ -20,6 +20,7 @@ from gyrostab.diagnose.conclusion.sentences import summary
 from gyrostab.diagnose.conclusion.verdict import decide_verdict, failed_checks
 from gyrostab.diagnose.effects.designs import Candidate
 from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.modelling.limits import mixture_limit
 from gyrostab.diagnose.modelling.refit import Estimate, Fitted
 from gyrostab.diagnose.naming.claims import Claim, Naming
 
@@ -152,3 +153,13 @@ def test_explained_means_that_the_evidence_is_for_it(gain, forecast, before, aft
     text = summary(content() | {"verdict": verdict, "unexplained": left, "held_out": held})
     assert text.endswith(".")
     assert ("do not describe the record well" in text) == bool(failed_checks(held))
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.0, 1e12), st.floats(1e-9, 1e12), st.floats(1e-300, 1.0)), min_size=1, max_size=6),
+)
+def test_a_limit_over_several_laws_lies_between_theirs(laws):
+    size, sd, share = np.array(laws).T
+    ends = size + 1.6448536269514722 * sd
+    limit = mixture_limit(size, sd, share / share.sum())
+    assert ends.min() * (1.0 - 1e-9) <= limit <= ends.max() * (1.0 + 1e-9)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
@@ -18,7 +19,7 @@ from gyrostab.diagnose.modelling.nuisance import plain_places
 from gyrostab.diagnose.naming.claims import Naming
 from gyrostab.physics.registry import effects
 
-__all__ = ["Limit", "limits"]
+__all__ = ["Limit", "limits", "mixture_limit"]
 
 _LEVEL = 0.95
 _MOST = 9  # variants
@@ -96,7 +97,28 @@ def _of_row(part: Part, family: Sequence[Variant], state: State) -> float:
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
     one_sided = part.variant.squared and part.candidate.view == "power"  # a product of two axes has either sign
     size = np.maximum(mean, 0.0) if one_sided else np.abs(mean)
+    return mixture_limit(size, sd, share)
+
+
+def mixture_limit(size: NDArray[np.float64], sd: NDArray[np.float64], share: NDArray[np.float64]) -> float:
+    """Find the number that a mixture of normal laws is below with a probability of 95 %.
+
+    Parameters
+    ----------
+    size, sd, share : ndarray, shape (law,)
+        Mean, standard deviation and weight of each law.
+
+    Examples
+    --------
+    >>> round(mixture_limit(np.array([1.0]), np.array([0.1]), np.array([1.0])), 3)
+    1.164
+    """
+
+    def excess(bound: float) -> float:
+        return float(share @ ndtr((bound - size) / sd)) - _LEVEL
+
     ends = size + _ONE_SIDED * sd
-    if np.ptp(ends) <= 1e-9 * ends.max():
-        return float(ends[0])
-    return float(brentq(lambda bound: float(share @ ndtr((bound - size) / sd)) - _LEVEL, ends.min(), ends.max()))
+    low, high = float(ends.min()), float(ends.max())
+    if excess(low) >= 0.0:  # by rounding: one law has all the weight, or all have one limit
+        return low
+    return high if excess(high) <= 0.0 else float(brentq(excess, low, high))
