@@ -90,30 +90,19 @@ def _add(quantity: str, factor: float, *spellings: str, offset: float = 0.0) -> 
         _PLAIN[key] = known if _PLAIN.get(key, known) == known else None
 
 
-_add("rate", 1.0, "deg/h", "dph")
-_add("rate", _RATE, "deg/s", "dps")
-_add("rate", 1e-3 * _RATE, "mdeg/s", "mdps")
-_add("rate", _RATE / _DEGREE, "rad/s")
-_add("rate", 1e-3 * _RATE / _DEGREE, "mrad/s")
-_add("rate", 1e-6 * _RATE / _DEGREE, "urad/s", "µrad/s", "microradian s-1")
-_add("rate", 1e-9 * _RATE / _DEGREE, "nrad/s", "nanoradian s-1")
-_add("rate", 1.0, "arcsec/s")  # 1 arcsec/s = 3600 arcsec/h = 1 deg/h
-_add("rate", 6.0 * _RATE, "rpm", "r/min", "rev/min")
-_add("rate", 360.0 * _RATE, "rev/s", "r/s")
-_add("rate", 6.0, "deg/min")
-_add("angle", 1.0, "deg")
-_add("angle", 1.0 / 3600.0, "arcsec", '"')
-_add("angle", 1.0 / _DEGREE, "rad")
-_add("angle", 1e-3 / _DEGREE, "mrad")
-_add("angle", 1e-6 / _DEGREE, "urad", "µrad", "microradian")
+_add("rate", 1.0, "dph")
+_add("rate", _RATE, "dps")
+_add("rate", 1e-3 * _RATE, "mdps")
+_add("rate", 6.0 * _RATE, "rpm", "r/min")
+_add("rate", 360.0 * _RATE, "r/s")
 _add("temperature", 1.0, "degC", "C", "celsius", "deg celsius")
 _add("temperature", 1.0, "K", "kelvin", "degK", offset=-273.15)
 _add("temperature", 5.0 / 9.0, "degF", "F", "fahrenheit", "deg fahrenheit", offset=-160.0 / 9.0)
 _add("acceleration", 1.0, "g", "gn", "gee", "gs", "g0", "g_n", "9.80665 m s-2")
 _add("acceleration", 1e-3, "mg", "milli-g", "milli g", "millig", "mgee")
 _add("acceleration", 1e-6, "ug", "µg", "micro-g", "microg")
-_add("acceleration", 1.0 / 9.80665, "m/s2", "m/s/s", "mps2", "meter/s2", "metre/s2", "meters/s2", "m/sec^2")
-_add("acceleration", 1e-2 / 9.80665, "gal", "cm/s2")
+_add("acceleration", 1.0 / 9.80665, "mps2")
+_add("acceleration", 1e-2 / 9.80665, "gal")
 _add("acceleration", 0.3048 / 9.80665, "ft/s2")
 _add("voltage", 1.0, "V", "volt", "volts", "Vdc")
 _add("voltage", 1e-3, "mV", "millivolt", "millivolts")
@@ -137,6 +126,33 @@ _add("magnetic", 100.0, "G", "gauss", "Gs")
 _add("magnetic", 0.1, "mG", "milligauss", "mgauss")
 _add("number", 1.0, "1", "-", "count", "")
 
+# Products of powers of angle, time and length: name -> (dimension, numerator, denominator), in degree, s and m.
+_BASES: dict[str, tuple[str, float, float]] = {
+    **dict.fromkeys(("deg", "degs", "degree", "degrees", "°", "arcdeg", "angular_degree"), ("angle", 1.0, 1.0)),
+    **dict.fromkeys(("rad", "radian", "radians"), ("angle", 1.0, _DEGREE)),
+    **dict.fromkeys(("arcmin", "arcminute", "arcminutes", "arc_minute", "arc_minutes"), ("angle", 1.0, 60.0)),
+    **dict.fromkeys(("arcsec", "arcsecs", "asec", "arcsecond", "arcseconds", "arc_second", "arc_seconds", '"'), ("angle", 1.0, 3600.0)),
+    **dict.fromkeys(("rev", "revs", "revolution", "revolutions", "turn", "turns", "cycle", "cycles"), ("angle", 360.0, 1.0)),
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), ("time", 1.0, 1.0)),
+    **dict.fromkeys(("min", "minute", "minutes"), ("time", 60.0, 1.0)),
+    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours"), ("time", 3600.0, 1.0)),
+    **dict.fromkeys(("d", "day", "days"), ("time", 86400.0, 1.0)),
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), ("length", 1.0, 1.0)),
+}
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2}
+_PREFIX_NAMES = {"nano": 1e-9, "micro": 1e-6, "milli": 1e-3, "centi": 1e-2}
+#: Powers of angle, time and length -> quantity, and the factor of degree, s and m to its inner unit.
+_SIGNATURES = {
+    (1, -1, 0): ("rate", _RATE, 1.0),
+    (1, 0, 0): ("angle", 1.0, 1.0),
+    (0, -2, 1): ("acceleration", 1.0, 9.80665),
+}
+_LISTED = {
+    "rate": "deg/h, arcsec/s, deg/s, rad/s, mrad/s, urad/s, nrad/s, rpm",
+    "angle": "deg, arcsec, rad, mrad, urad",
+    "acceleration": "g, mg, m/s^2",
+}
+_TOKEN = re.compile(r'\s*(/|per\b)?\s*\(?\s*([A-Za-zµμ°"_]+)([+-]?\d)?\s*\)?', re.IGNORECASE)
 _NUMBER = re.compile(r"^([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*\*?\s*(.+)$")
 
 
@@ -197,9 +213,51 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     raise UnitError(f"unit {text!r} is not known; known are, for instance, {known_units('rate')} for gyro axes")
 
 
+def _parse_base(name: str) -> tuple[str, float, float] | None:
+    """Return dimension, numerator and denominator of a name with or without a prefix.
+
+    Upper and lower case are alike but for prefixes of one letter: ``MRAD`` may be milli or mega, and is refused.
+    """
+    if name.lower() in _BASES:
+        return _BASES[name.lower()]
+    for prefixes, head, base in (
+        (_PREFIXES, name[:1], name[1:]),
+        *((_PREFIX_NAMES, prefix, name[len(prefix) :]) for prefix in _PREFIX_NAMES if name.lower().startswith(prefix)),
+    ):
+        if head.lower() != head and prefixes is _PREFIXES:
+            continue
+        if head in prefixes and base.lower().lstrip("_") in _BASES:
+            dimension, numerator, denominator = _BASES[base.lower().lstrip("_")]
+            return dimension, prefixes[head] * numerator, denominator
+    return None
+
+
+def _parse_product(text: str) -> tuple[str, float, float] | None:
+    """Read a product of powers as UDUNITS writes them (``rad.s-1``, ``degree per second``): quantity, factor and offset."""
+    text = re.sub(r"\s*[.⋅×]\s*(?=[^\s\d])", " ", _normal(text).replace("^", ""))
+    text = re.sub(r"_?\bper\b_?|_per_", "/", text, flags=re.IGNORECASE)
+    powers = {"angle": 0, "time": 0, "length": 0}
+    up = down = 1.0
+    end = 0
+    while end < len(text):
+        match = _TOKEN.match(text, end)
+        base = _parse_base(match.group(2)) if match else None
+        if match is None or base is None:
+            return None
+        end = match.end()
+        dimension, numerator, denominator = base
+        power = int(match.group(3) or 1) * (-1 if match.group(1) else 1)
+        powers[dimension] += power
+        if power < 0:
+            numerator, denominator = denominator, numerator
+        up, down = up * numerator ** abs(power), down * denominator ** abs(power)
+    found = _SIGNATURES.get((powers["angle"], powers["time"], powers["length"]))
+    return None if found is None else (found[0], up * found[1] / (down * found[2]), 0.0)
+
+
 def _find(text: str, quantity: str | None) -> tuple[str, float, float] | None:
-    """Quantity, factor and offset of a spelling: as it is written, then with its case and blanks ignored."""
-    exact = _SPELLINGS.get(_normal(text))
+    """Return quantity, factor and offset of a spelling: as it is written, then with its case and blanks ignored."""
+    exact = _SPELLINGS.get(_normal(text)) or _parse_product(text)
     if exact is not None and quantity in (None, exact[0]):
         return exact
     plain = _plain(text)
@@ -219,12 +277,12 @@ def known_units(quantity: str) -> str:
     >>> known_units("pressure")
     'Pa, hPa, kPa, dbar, bar, MPa, mPa, psi, atm'
     """
+    if quantity in _LISTED:
+        return _LISTED[quantity]
     seen: dict[tuple[float, float], str] = {}
     for spelling, (name, factor, offset) in _SPELLINGS.items():
         if name == quantity:
             seen.setdefault((factor, offset), spelling)
-    if quantity == "rate":
-        seen[(1.0, 0.0)] = "deg/h, arcsec/s"
     return ", ".join(seen.values())
 
 

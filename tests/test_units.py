@@ -29,6 +29,32 @@ def test_conversion_agrees_with_udunits(text, udunits):
         assert value * unit.factor + unit.offset == pytest.approx(cf_units.Unit(udunits).convert(value, inner), rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "rad.s-1", "rad*s**-1", "s-1 rad", "radians/second", "Degree/Second", "DEGREE/HOUR", "degree per hour", "°/s", "mrad.s^-1",
+        "microradians/second", "millidegree s-1", "arc_second/second", "arcsec/sec", "arc_minute s-1", "turn/min", "revolutions/minute",
+        "cycle s-1", "rad/ms", "degree/day", "1e-3 rad.s-1", "m s^-2", "meter second-2", "cm/s2",
+    ],
+)  # fmt: skip
+def test_what_udunits_reads_is_read_alike(text):
+    unit = parse_unit(text)
+    inner = cf_units.Unit(on_disk(INNER[unit.quantity]))
+    assert unit.factor == pytest.approx(cf_units.Unit(text).convert(1.0, inner), rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ("DEG/HR", "degree/hour"), ("degrees_per_second", "degree/second"), ("deg.h^-1", "degree/hour"), ("RAD/S", "radian/second"),
+        ("deg/(s)", "degree/second"), ("°·s⁻¹", "degree/second"), ("deg⋅s⁻¹", "degree/second"), ("rad · s^-1", "radian/second"),
+        ("mRad/S", "1e-3 radian/second"), ("dps", "degree/second"), ("mdps", "1e-3 degree/second"), ("mdeg/s", "1e-3 degree/second"),
+    ],
+)  # fmt: skip
+def test_spellings_of_data_sheets(text, plain):
+    assert parse_unit(text).factor == pytest.approx(cf_units.Unit(plain).convert(1.0, cf_units.Unit("degree hour-1")), rel=1e-14)
+
+
 def test_every_unit_we_write_is_read_by_udunits_as_it_is_meant():
     for name, attributes in VARIABLES.items():
         if "units" in attributes:
@@ -41,7 +67,10 @@ def test_every_unit_we_write_is_read_by_udunits_as_it_is_meant():
         )
 
 
-@pytest.mark.parametrize("text", ["furlong/fortnight", "deg//h", "0 deg/h", "nan deg/h", "1e400 deg/h"])
+@pytest.mark.parametrize(
+    "text",
+    ["furlong/fortnight", "deg//h", "0 deg/h", "nan deg/h", "1e400 deg/h", "MRAD/S", "deg/h/h", "rad s -1", "rad/s-1", "/s", "deg/", "MS"],
+)
 def test_what_is_not_a_unit_is_refused_with_what_is(text):
     with pytest.raises(UnitError):
         parse_unit(text)

@@ -13,9 +13,9 @@ from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Column, Plan
 from gyrostab.read.intake import Intake, summary_of
 from gyrostab.read.options import FileSummary, ReadOptions
-from gyrostab.read.stamps import NAT, cells_to_ns, floats_to_ns, integers_to_ns, looks_iso
+from gyrostab.read.stamps import NAT, cells_to_ns, dates_to_ns, floats_to_ns, integers_to_ns, looks_iso
 
-__all__ = ["holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
+__all__ = ["Fetch", "holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
 
 BATCH_ROWS = 2**20
 ENDS = 64
@@ -50,7 +50,7 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
     array = np.ma.getdata(values) if mask is not None else np.asarray(values)
     unit = column.time_unit
     if array.dtype.kind == "M":
-        stamps = array.astype("datetime64[ns]").view(np.int64)
+        stamps = dates_to_ns(array)
     elif unit is None or array.dtype.kind not in "iuf":
         stamps = cells_to_ns(["" if value is None else str(value) for value in array], unit, options.epoch_ns)
     elif array.dtype.kind == "f":

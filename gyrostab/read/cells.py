@@ -72,7 +72,7 @@ def _since_epoch(counts: NDArray[np.int64], typing: Typing) -> NDArray[np.int64]
     unit = typing.unit
     if unit is None:
         return counts
-    if unit.ns != 10**typing.digits:
+    if unit.digits is None or unit.ns != 10**typing.digits:
         return np.where(counts == NAT, NAT, integers_to_ns(counts, unit, typing.options.epoch_ns))
     zero = typing.options.epoch_ns if unit.epoch is None else unit.epoch
     return counts if zero == 0 else np.where((counts != NAT) & _sum_fits(counts, zero), counts + np.int64(zero), NAT)

@@ -28,7 +28,7 @@ from gyrostab.read.headers import (
     unit_quantity,
 )
 from gyrostab.read.options import ColumnSummary, ReadOptions
-from gyrostab.read.stamps import TimeUnit, parse_time_unit
+from gyrostab.read.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.units import INNER, known_units, parse_unit
 
 __all__ = ["Column", "Plan", "plan_columns", "split_header"]
@@ -84,6 +84,7 @@ def plan_columns(
     options: ReadOptions,
     *,
     units: Mapping[int, str] | None = None,
+    calendars: Mapping[int, str] | None = None,
     stamped: Collection[int] = (),
     rising: Callable[[int], bool] | None = None,
     presets: Mapping[int, str] | None = None,
@@ -100,6 +101,8 @@ def plan_columns(
         What the user said.
     units : mapping of int to str, optional
         Units that the format stores beside the header (NetCDF attributes).
+    calendars : mapping of int to str, optional
+        CF calendars of those units that name an epoch.
     stamped : collection of int
         Columns whose values are dates already (ISO 8601 text, datetime types).
     rising : callable, optional
@@ -113,7 +116,7 @@ def plan_columns(
         Nothing is raised here; ``Plan.check()`` raises what is wrong.
     """
     work = _Work(path, options, rising or (lambda source: True))
-    named = work.name(headers, units or {}, frozenset(stamped), presets or {})
+    named = work.name(headers, units or {}, calendars or {}, frozenset(stamped), presets or {})
     named = work.separate(named)
     time = work.find_time(named)
     rest = [column for column in named if column is not time]
@@ -145,14 +148,22 @@ class _Work:
         self.used_map: set[str] = set()
         self.used_units: set[str] = set()
 
-    def name(self, headers: Sequence[str], units: Mapping[int, str], stamped: frozenset[int], presets: Mapping[int, str]) -> list[Header]:
+    def name(
+        self,
+        headers: Sequence[str],
+        units: Mapping[int, str],
+        calendars: Mapping[int, str],
+        stamped: frozenset[int],
+        presets: Mapping[int, str],
+    ) -> list[Header]:
         """Apply the map, then the preset, and drop what they drop."""
         wanted = {key.strip().lower(): key for key in self.options.map}
         targets = {split_header(target)[0].lower() for target in self.options.map.values()}
         named: list[Header] = []
         for column in distinct_columns(headers):
             source = column.source
-            column.stored, column.stamped = units.get(source), source in stamped
+            column.stored, column.calendar = units.get(source), calendars.get(source)
+            column.stamped = source in stamped
             texts = (column.key.lower(), column.header.lower(), column.low)
             key = next((wanted[text] for text in texts if text in wanted), None)
             if key is not None:
@@ -229,12 +240,15 @@ class _Work:
         self._summarise(column, "time", "time", "time", unit.text if unit else "ISO 8601" if column.stamped else None)
         if unit is not None and unit.epoch is None and self.options.epoch is None and not self.options.channels_only:
             self.notes.append("numeric time is counted from 1970-01-01T00:00:00 UTC; give --epoch for another zero")
+        if unit is not None and unit.epoch is not None and self.options.epoch is not None:
+            self.notes.append(f"--epoch is not used: the time column {column.header!r} is in {unit.text!r}")
         return column
 
     @staticmethod
     def _may_be_time(column: Header) -> bool:
         written = column.unit or column.stored
-        return written is None or is_time_unit(written)
+        # An epoch that cannot be read is reported, not passed over.
+        return written is None or names_epoch(written) or is_time_unit(written)
 
     def _time_unit(self, column: Header) -> TimeUnit | None:
         suffix = TIME.match(split_header(column.header)[0].lower())
@@ -247,9 +261,10 @@ class _Work:
             self.problems.append(MissingUnitError(f"{message}; give it with --unit time=s (or ms, us, ns)"))
             return None
         try:
-            return parse_time_unit(text)
+            return parse_time_unit(text, column.calendar if text == column.stored else None)
         except GyrostabError as error:
-            self.problems.append(UnitError(f"{self.path.name}: column {column.header!r}: {error}; give it with --unit time=s"))
+            how = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
+            self.problems.append(UnitError(f"{self.path.name}: column {column.header!r}: {error}; or give it with --unit {how}"))
             return None
 
     def plan_gyro(self, gyro: list[Header], headers: Sequence[str]) -> tuple[str | None, str | None]:

@@ -47,6 +47,7 @@ class Header:
     name: str
     unit: str | None
     stored: str | None = None  # the unit that the format keeps beside the header, weaker than --unit
+    calendar: str | None = None  # the CF calendar of that unit
     mapped: bool = False  # by the user
     preset: bool = False  # known from the program that wrote the file
     stamped: bool = False

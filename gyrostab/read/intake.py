@@ -220,7 +220,7 @@ class Intake:
             raise FormatError(f"{name}: there is a header but no data row below it; copy it again, or look at what the logger wrote")
         if self.bad_rows > MAX_UNREADABLE * rows:
             share, first = self.bad_rows / rows, self.bad_places[0]
-            what = "the separator, the columns that --map names and the units of time"
+            what = "the separator, the columns that --map names and the unit of time (stamps lie in the years 1678 to 2262)"
             raise FormatError(f"{name}: {share:.0%} of {rows} rows are unreadable, the first is {first}; look at it, and check {what}")
         columns = self.buffers.finish()
         stamps = self._stamps(columns)

@@ -15,10 +15,11 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.read.arrays import float32_note, read_columns, summarise
+from gyrostab.read.arrays import Fetch, float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.options import FileSummary, ReadOptions
+from gyrostab.read.packing import ATTRIBUTES, fold_packing, text_attributes
 
 __all__ = ["matches", "read", "scan"]
 
@@ -55,20 +56,20 @@ def matches(path: Path) -> bool:
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Variables and their shapes, the stamps of the two ends."""
     with ExitStack() as stack:
-        vectors, plan, notes = _look(path, options, stack)
+        vectors, plan, fetch, notes = _look(path, options, stack)
         name = "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab"
-        return summarise(name, plan, options, vectors[0].rows, lambda source, a, b: vectors[source].part(a, b), notes)
+        return summarise(name, plan, options, vectors[0].rows, fetch, notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a MATLAB file; see `gyrostab.read.read_log`."""
     with ExitStack() as stack:
-        vectors, plan, notes = _look(path, options, stack)
+        vectors, plan, fetch, notes = _look(path, options, stack)
         notes += float32_note(plan, [vector.array.dtype for vector in vectors])
-        return read_columns(plan, options, vectors[0].rows, lambda source, a, b: vectors[source].part(a, b), notes=notes, limit=limit)
+        return read_columns(plan, options, vectors[0].rows, fetch, notes=notes, limit=limit)
 
 
-def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vector], Plan, list[str]]:
+def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vector], Plan, Fetch, list[str]]:
     found = [vector for name, array in _arrays(path, stack) for vector in _vectors(name, array)]
     if not found:
         raise FormatError(
@@ -78,14 +79,17 @@ def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vec
     kept = [vector for vector in found if vector.rows == rows]
     others = [vector.header for vector in found if vector.rows != rows]
     notes = [f"left out, as they are shorter than the {rows} rows of the longest: {', '.join(others[:20])}"] if others else []
-    units = {place: text for place, vector in enumerate(kept) if (text := _units(vector.array))}
-    return kept, plan_columns(path, [vector.header for vector in kept], options, units=units), notes
+    attributes = [_attributes(vector.array) for vector in kept]
+    units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
+    plan = plan_columns(path, [vector.header for vector in kept], options, units=units, calendars=calendars)
+    plan, decoders = fold_packing(plan, [vector.array.dtype for vector in kept], attributes)
+    return kept, plan, lambda source, start, stop: decoders[source](kept[source].part(start, stop)), notes
 
 
-def _units(array: Any) -> str | None:
-    """The attribute ``units`` of an HDF5 dataset."""
-    text = getattr(array, "attrs", {}).get("units")
-    return text.decode() if isinstance(text, bytes) else text if isinstance(text, str) else None
+def _attributes(array: Any) -> dict[str, Any]:
+    """Return what the attributes of an HDF5 dataset say of its numbers; such a file may follow the CF conventions."""
+    attributes = getattr(array, "attrs", {})
+    return {name: attributes[name] for name in ATTRIBUTES if name in attributes}
 
 
 def _vectors(name: str, array: Any) -> Iterator[_Vector]:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from gyrostab.read.arrays import float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
+from gyrostab.read.packing import Decoder, fold_packing, text_attributes
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
 from gyrostab.store import open_stored, stored_attribute
 from gyrostab.timegrid import grid_times, time_coordinate
@@ -63,8 +65,8 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     import netCDF4
 
     with netCDF4.Dataset(path) as file:
-        columns, rows, plan, notes = _look(path, file, options)
-        return summarise("netcdf", plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes)
+        columns, rows, plan, decoders, notes = _look(path, file, options)
+        return summarise("netcdf", plan, options, rows, partial(_fetch, columns, decoders), notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
@@ -75,9 +77,10 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     import netCDF4
 
     with netCDF4.Dataset(path) as file:
-        columns, rows, plan, notes = _look(path, file, options)
+        columns, rows, plan, decoders, notes = _look(path, file, options)
         notes += float32_note(plan, [column.variable.dtype for column in columns])
-        return read_columns(plan, options, rows, lambda source, a, b: columns[source].part(a, b), notes=notes, limit=limit)
+        fetch = partial(_fetch, columns, decoders)
+        return read_columns(plan, options, rows, fetch, notes=notes, limit=limit)
 
 
 def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
@@ -182,7 +185,11 @@ def _stamp(log: xr.Dataset, place: int) -> np.datetime64:
     return np.datetime64(int(log["time"][place].values.astype("datetime64[ns]").view(np.int64)), "ns")
 
 
-def _look(path: Path, file: Any, options: ReadOptions) -> tuple[list[_Column], int, Plan, list[str]]:
+def _fetch(columns: list[_Column], decoders: dict[int, Decoder], source: int, start: int, stop: int) -> Any:
+    return decoders[source](columns[source].part(start, stop))
+
+
+def _look(path: Path, file: Any, options: ReadOptions) -> tuple[list[_Column], int, Plan, dict[int, Decoder], list[str]]:
     numeric = [v for v in file.variables.values() if getattr(v.dtype, "kind", "O") in "iuf" and v.ndim in (1, 2)]
     lines = Counter(v.dimensions[0] for v in numeric if v.ndim == 1)
     lines.update(max(v.dimensions, key=lambda d: len(file.dimensions[d])) for v in numeric if v.ndim == 2)
@@ -198,22 +205,22 @@ def _look(path: Path, file: Any, options: ReadOptions) -> tuple[list[_Column], i
         left += [] if found else [variable.name]
     if left:
         notes.append(f"left out, as they do not run along {dim!r} alone: {', '.join(left[:20])}")
-    units = {index: str(column.variable.units) for index, column in enumerate(columns) if "units" in column.variable.ncattrs()}
-    plan = plan_columns(path, [column.header for column in columns], options, units=units)
-    return columns, len(file.dimensions[dim]), _with_own_factors(plan, columns), notes
+    attributes = [_attributes(column.variable) for column in columns]
+    units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
+    plan = plan_columns(path, [column.header for column in columns], options, units=units, calendars=calendars)
+    plan, decoders = fold_packing(plan, [column.variable.dtype for column in columns], attributes)
+    return columns, len(file.dimensions[dim]), plan, decoders, notes
 
 
-def _with_own_factors(plan: Plan, columns: list[_Column]) -> Plan:
-    """Read the counts of packed variables, and take their factor and that of the unit as one."""
-    found = []
-    for column in plan.columns:
-        variable = columns[column.source].variable
-        attrs = variable.ncattrs()
-        if column.role != "time" and "scale_factor" in attrs and not getattr(variable, "add_offset", 0):
-            variable.set_auto_scale(False)
-            column = replace(column, factor=column.factor * float(variable.scale_factor))
-        found.append(column)
-    return replace(plan, columns=tuple(found))
+def _attributes(variable: Any) -> dict[str, Any]:
+    """Return the attributes of a variable, and the fill value that the library gives to one without its own."""
+    import netCDF4
+
+    variable.set_auto_maskandscale(False)
+    attributes = {name: variable.getncattr(name) for name in variable.ncattrs()}
+    if not {"_FillValue", "_Unsigned"} & set(attributes) and variable.dtype.itemsize > 1:  # bytes have no default (users guide)
+        attributes["_FillValue"] = variable.dtype.type(netCDF4.default_fillvals[variable.dtype.str[1:]])
+    return attributes
 
 
 def _columns(file: Any, variable: Any, dim: str) -> list[_Column]:

@@ -76,7 +76,7 @@ def _plain(column: Any) -> Any:
     column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     kind = column.type
     if pa.types.is_timestamp(kind):
-        return column.cast(pa.timestamp("ns", tz=kind.tz), safe=False).cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False)
+        return column.cast(pa.timestamp(kind.unit)).to_numpy(zero_copy_only=False)  # in UTC; `to_stamps` converts the unit
     if pa.types.is_integer(kind) and column.null_count:
         return np.ma.array(column.fill_null(0).to_numpy(zero_copy_only=False), mask=column.is_null().to_numpy(zero_copy_only=False))
     if pa.types.is_decimal(kind):

@@ -1,4 +1,9 @@
-"""Time stamps as integers: nanoseconds since 1970-01-01T00:00:00 UTC, without a float on the way where the text is exact."""
+"""Time stamps as integers: nanoseconds since 1970-01-01T00:00:00 UTC, without a float on the way where the text is exact.
+
+References
+----------
+CF conventions 1.11, section 4.4 (time coordinate, calendars).
+"""
 
 from __future__ import annotations
 
@@ -13,25 +18,42 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
-from gyrostab.timegrid import stamp_ns
+from gyrostab.timegrid import split_instant
 
-__all__ = ["NAT", "TimeUnit", "cells_to_ns", "floats_to_ns", "integers_to_ns", "looks_iso", "parse_time_unit", "texts_to_ns"]
+__all__ = [
+    "NAT",
+    "TimeUnit",
+    "cells_to_ns",
+    "dates_to_ns",
+    "floats_to_ns",
+    "integers_to_ns",
+    "looks_iso",
+    "names_epoch",
+    "parse_time_unit",
+    "texts_to_ns",
+]
 
 #: The integer of ``NaT``.
 NAT = np.iinfo(np.int64).min
 _LIMIT = 2**63 - 1
+#: Julian day number of 1970-01-01.
+_ORDINAL_1970 = 2440588
 
 _UNITS = {
-    1: ("ns", "nsec", "nanosecond", "nanoseconds"),
-    10**3: ("us", "µs", "μs", "usec", "microsecond", "microseconds"),
-    10**6: ("ms", "msec", "millis", "millisecond", "milliseconds"),
+    1: ("ns", "nsec", "nsecs", "nanosecond", "nanoseconds"),
+    10**3: ("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"),
+    10**6: ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"),
     10**9: ("s", "sec", "secs", "second", "seconds"),
-    60 * 10**9: ("min", "minute", "minutes"),
-    3600 * 10**9: ("h", "hr", "hour", "hours"),
+    60 * 10**9: ("min", "mins", "minute", "minutes"),
+    3600 * 10**9: ("h", "hr", "hrs", "hour", "hours"),
     86400 * 10**9: ("d", "day", "days"),
+    7 * 86400 * 10**9: ("week", "weeks"),
 }
 _NANOSECONDS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
 _ISO = re.compile(r"^\s*\d{4}-?\d\d-?\d\d([T ]\d\d(:?\d\d){0,2}([.,]\d+)?\s*(Z|[+-]\d\d(:?\d\d)?)?)?\s*$")
+_SINCE = re.compile(r"\bsince\b", re.IGNORECASE)
+#: Calendars in which a date is an instant; the others are those of climate models, whose dates never were.
+_CALENDARS = {"standard": "standard", "gregorian": "standard", "proleptic_gregorian": "proleptic_gregorian", "julian": "julian"}
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?$")
 
 
@@ -45,32 +67,78 @@ class TimeUnit:
 
     @property
     def digits(self) -> int | None:
-        """Decimals that make one nanosecond (9 for seconds), or None when the unit is no power of ten of it."""
+        """Decimals that make one nanosecond (9 for seconds), or None when the unit is no power of ten of it.
+
+        Also None when the epoch is outside the years 1678 to 2262, so that sums with it exceed 64 bits.
+        """
+        if self.epoch is not None and abs(self.epoch) > _LIMIT:
+            return None
         return next((n for n in range(13) if self.ns == 10**n), None)
 
 
-def parse_time_unit(text: str) -> TimeUnit:
+def names_epoch(text: str) -> bool:
+    """Return whether a unit is one of time since an epoch, such as ``seconds since 1970-01-01``."""
+    return bool(_SINCE.search(text))
+
+
+def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     """Read a time unit, with a factor in front or a CF epoch behind if there is one.
+
+    Parameters
+    ----------
+    text : str
+        The unit; upper and lower case are alike, as in UDUNITS.
+    calendar : str, optional
+        The CF calendar of the epoch, `standard` when not given.
 
     Raises
     ------
     UnitError
-        When the text is no time unit.
+        When the text is no time unit, when its epoch can be read in several ways or depends on the clock, or when the
+        calendar is not one of real dates.
 
     Examples
     --------
     >>> parse_time_unit("us").ns
     Fraction(1000, 1)
-    >>> parse_time_unit("seconds since 1970-01-02 00:00:00").epoch
+    >>> parse_time_unit("Seconds Since 1970-01-02 00:00:00").epoch
     86400000000000
     """
-    name, _, since = (part.strip() for part in text.strip().partition(" since "))
-    epoch = stamp_ns(since, f"time unit {text!r}") if since else None
+    name, *since = (part.strip() for part in _SINCE.split(text, maxsplit=1))
+    epoch = _epoch_ns(text, since[0], calendar) if since else None
     factor, _, bare = name.rpartition(" ")
-    ns = _NANOSECONDS.get(bare.lower() if bare.lower() in _NANOSECONDS else bare)
+    ns = None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))  # Ms: a megasecond, or a slip
     if ns is None or (factor and not _NUMBER.match(factor.strip())):
-        raise UnitError(f"time unit {text!r} is not known; known are s, ms, us, ns, min, h, d, with a factor in front if needed")
-    return TimeUnit(text, ns * Fraction(factor.strip() or "1"), epoch)
+        known = "s, ms, us, ns, min, h, d, week, with a factor in front if needed"
+        raise UnitError(f"time unit {text!r} is not known; known are {known}; months and years have no fixed length")
+    scale = Fraction(factor.strip() or "1")
+    if scale <= 0:
+        raise UnitError(f"time unit {text!r}: the factor {factor} is not usable; give a number above 0")
+    return TimeUnit(text, ns * scale, epoch)
+
+
+def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
+    """Return the epoch [ns since 1970] of a unit, however far back it is."""
+    import cftime
+
+    known = _CALENDARS.get((calendar or "standard").strip().lower())
+    if known is None:
+        raise UnitError(
+            f"time unit {text!r}: dates of the calendar {calendar!r} are not instants of a recording; "
+            "write the times in the standard calendar"
+        )
+    fields = split_instant(since)
+    try:
+        if fields is None:
+            raise ValueError
+        year, month, day, nanoseconds = fields
+        days = cftime.datetime(year, month, day, calendar=known).toordinal() - _ORDINAL_1970
+    except ValueError:
+        raise UnitError(
+            f"time unit {text!r}: {since!r} is not a date that can be read in one way only; "
+            "write the year first, as in 'seconds since 2026-01-02T00:00:00'"
+        ) from None
+    return int(days) * 86400 * 10**9 + nanoseconds
 
 
 def looks_iso(text: str) -> bool:
@@ -78,21 +146,50 @@ def looks_iso(text: str) -> bool:
     return bool(_ISO.match(text)) and not text.strip().isdigit()
 
 
+def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
+    """Convert datetime64 of any unit to nanoseconds since 1970; what 64 bits do not hold (before 1678, after 2262) is `NAT`.
+
+    numpy itself wraps such dates around in silence.
+
+    Parameters
+    ----------
+    dates : ndarray of datetime64
+        Dates, any shape.
+
+    Examples
+    --------
+    >>> dates_to_ns(np.array(["1500-01-01", "1970-01-02"], dtype="datetime64[us]")).tolist()
+    [-9223372036854775808, 86400000000000]
+    """
+    native = dates.astype(dates.dtype.newbyteorder("="), copy=False)
+    low, high = (np.datetime64(day, "D").astype(native.dtype) for day in ("1677-09-22", "2262-04-11"))
+    outside = (native < low) | (native > high)
+    if native.dtype == np.dtype("datetime64[ns]") or not outside.any():
+        return native.astype("datetime64[ns]").view(np.int64)
+    return np.where(outside, np.datetime64("NaT"), native).astype("datetime64[ns]").view(np.int64)
+
+
 def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
     """Stamps of ISO 8601 texts (UTC unless they say otherwise); unreadable ones are `NAT`."""
     stamps = pd.to_datetime(pd.Series(list(texts), dtype=object), format="ISO8601", utc=True, errors="coerce")
-    return np.asarray(stamps.dt.tz_convert(None).to_numpy(dtype="datetime64[ns]")).view(np.int64)
+    return dates_to_ns(stamps.dt.tz_convert(None).to_numpy())
 
 
 def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
     """Stamps of whole numbers of `unit` since `epoch`; a stamp outside the years 1678 to 2262 is `NAT`."""
     zero = epoch if unit.epoch is None else unit.epoch
     up, down = unit.ns.numerator, unit.ns.denominator
-    limit = (_LIMIT - abs(zero) * down - down) // up
-    inside = (values <= limit) & (values >= -limit)
-    counts = np.where(inside, values, 0)
-    scaled = counts * up if down == 1 else (counts * up + down // 2) // down
-    return np.where(inside, scaled + zero, NAT)
+    # Whole units of the epoch are added to the counts, so that no sum exceeds 64 bits however far back it is.
+    units, rest = divmod(zero, up) if down == 1 else (0, zero)
+    limit = (_LIMIT - down) // up - 1
+    if max(abs(units), abs(rest)) > _LIMIT // 2:
+        return np.full(np.shape(values), NAT, dtype=np.int64)
+    inside = (values <= min(limit - units, _LIMIT)) & (values >= max(-limit - units, -_LIMIT))
+    scaled = np.where(inside, values + np.where(inside, units, 0), 0) * up
+    if down > 1:
+        scaled = (scaled + down // 2) // down
+    inside &= (scaled <= _LIMIT - max(rest, 0)) & (scaled >= -_LIMIT - min(rest, 0))
+    return np.where(inside, np.where(inside, scaled, 0) + rest, NAT)
 
 
 def floats_to_ns(values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:

@@ -19,6 +19,7 @@ from gyrostab.errors import FormatError
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.optional import library
 from gyrostab.read.options import FileSummary, ReadOptions
+from gyrostab.read.stamps import NAT, dates_to_ns
 from gyrostab.read.tables import Part, Table, plain_names, read_tables, scan_tables
 
 __all__ = ["matches", "read", "scan"]
@@ -71,7 +72,12 @@ def _clock(channel: Any) -> tuple[float, Any] | None:
     start = properties.get("wf_start_time")
     if step <= 0.0:
         return None
-    start = None if start is None or np.datetime64(start, "us") < _NO_DATE else np.datetime64(start, "ns")
+    start = None if start is None or np.datetime64(start, "us") < _NO_DATE else np.datetime64(start, "us")
+    if start is not None:
+        began = int(dates_to_ns(np.array(start)))
+        if began == NAT:
+            raise FormatError(f"channel {channel.name!r} begins at {start}, which is after the year 2262; correct wf_start_time")
+        start = np.datetime64(began, "ns")
     offset = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
     return step, offset if start is None else start + np.timedelta64(offset, "ns")
 

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
+from gyrostab.timegrid import stamp_ns
 
 __all__ = ["LEVEL_SPANS", "loudness", "quiet_blocks", "quiet_spans"]
 
@@ -187,10 +188,7 @@ def _seconds(reduced: xr.Dataset, edge: Any) -> float:
     if isinstance(edge, int | float | np.integer | np.floating):
         return float(edge)
     start = np.datetime64(str(reduced.attrs["start"]).removesuffix("Z"), "ns")
-    try:
-        instant = np.datetime64(str(edge).removesuffix("Z"), "ns")
-    except ValueError as error:
-        raise OptionError(f"quiet: {edge!r} is neither seconds since the start nor an ISO time") from error
+    instant = np.datetime64(stamp_ns(str(edge), "quiet:"), "ns")
     return float((instant - start) / np.timedelta64(1, "ns")) / 1e9
 
 

@@ -1,0 +1,143 @@
+"""Packed variables of NetCDF and HDF5 files, against values that are computed from the CF conventions by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.errors import FormatError
+from gyrostab.read import read_log
+from gyrostab.read.packing import Packing
+
+ROWS = 60
+
+
+def write(path: Path, stored: np.ndarray, attributes: dict[str, Any], *, time: dict[str, Any] | None = None, form: str = "NETCDF4") -> Path:
+    """One gyro axis of the given stored numbers; the fill value goes in with the other attributes."""
+    time = {"units": "s", **(time or {})}
+    if path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            for name, values, attrs in (("time", np.arange(ROWS, dtype="i4"), time), ("gyro_x", stored, {"units": "deg/h", **attributes})):
+                file[name] = values
+                file[name].attrs.update(attrs)
+        return path
+    with netCDF4.Dataset(path, "w", format=form) as file:
+        file.createDimension("obs", ROWS)
+        for name, values, attrs in (("time", np.arange(ROWS, dtype="i4"), time), ("gyro_x", stored, {"units": "deg/h", **attributes})):
+            endian = "big" if values.dtype.str[0] == ">" and form == "NETCDF4" else "native"
+            kind = values.dtype if endian == "big" else values.dtype.newbyteorder("=")
+            variable = file.createVariable(name, kind, ("obs",), fill_value=attrs.pop("_FillValue", None), endian=endian)
+            variable.set_auto_maskandscale(False)
+            variable.setncatts(attrs)
+            variable[:] = values
+    return path
+
+
+COUNTS = np.arange(ROWS, dtype="i2") - 30
+BYTES = np.arange(100, 100 + ROWS, dtype="u1")
+FLOATS = COUNTS.astype("f4") / 10
+INVALID = np.isin(COUNTS, [-30, 29])
+
+CASES = {
+    "plain": (COUNTS, {}, COUNTS.astype(float)),
+    "scale and offset": (COUNTS, {"scale_factor": 0.1, "add_offset": 5.0}, COUNTS * 0.1 + 5.0),
+    "whole scale": (COUNTS, {"scale_factor": np.int16(3), "add_offset": np.int16(-7)}, COUNTS * 3.0 - 7.0),
+    "big endian": (COUNTS.astype(">i2"), {"scale_factor": 0.5}, COUNTS * 0.5),
+    "fill": (COUNTS, {"_FillValue": np.int16(-30), "missing_value": np.int16(29)}, np.where(INVALID, np.nan, COUNTS)),
+    "several missing": (COUNTS, {"missing_value": np.array([-30, 29], "i2"), "scale_factor": 2.0}, np.where(INVALID, np.nan, COUNTS * 2.0)),
+    "missing of another type": (COUNTS, {"missing_value": np.array([-30.0, 29.0, np.nan, 1e9])}, np.where(INVALID, np.nan, COUNTS)),
+    "missing among floats": (
+        FLOATS,
+        {"missing_value": np.float64(-0.1), "_FillValue": np.float32(np.nan)},
+        np.where(COUNTS == -1, np.nan, FLOATS.astype(float)),
+    ),
+    "valid range": (COUNTS, {"valid_range": np.array([-29, 28], "i2")}, np.where(INVALID, np.nan, COUNTS)),
+    "valid range, packed": (
+        COUNTS,
+        {"valid_range": np.array([-29, 28], "i2"), "scale_factor": 0.1},
+        np.where(INVALID, np.nan, COUNTS * 0.1),
+    ),
+    "valid range, unpacked": (
+        COUNTS,
+        {"valid_range": np.array([-2.9, 2.8]), "scale_factor": 0.1},
+        np.where(INVALID, np.nan, COUNTS * 0.1),
+    ),
+    "valid range, unpacked, mirrored": (COUNTS, {"valid_min": -2.8, "scale_factor": -0.1}, np.where(COUNTS > 28, np.nan, COUNTS * -0.1)),
+    "valid min": (COUNTS, {"valid_min": np.int16(-29)}, np.where(COUNTS < -29, np.nan, COUNTS)),
+    "valid max": (COUNTS, {"valid_max": np.int16(28), "add_offset": 100.0}, np.where(COUNTS > 28, np.nan, COUNTS + 100.0)),
+    "valid max of a float": (FLOATS, {"valid_max": 2.8}, np.where(COUNTS > 28, np.nan, FLOATS.astype(float))),
+    "unsigned": (BYTES.view("i1"), {"_Unsigned": "true"}, BYTES.astype(float)),
+    "unsigned, packed": (BYTES.view("i1"), {"_Unsigned": "true", "scale_factor": 0.5, "add_offset": -50.0}, BYTES * 0.5 - 50.0),
+    "unsigned, with fill": (
+        BYTES.view("i1"),
+        {"_Unsigned": "true", "_FillValue": np.int8(-97), "valid_range": np.array([101, -98], "i1"), "scale_factor": 0.5},
+        np.where((BYTES == 159) | (BYTES == 100), np.nan, BYTES * 0.5),
+    ),
+    "signed": (COUNTS.view("u2"), {"_Unsigned": "false", "scale_factor": 0.5}, COUNTS * 0.5),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:variable 'gyro_x' has multiple fill values")
+@pytest.mark.parametrize("form", ["NETCDF4", "NETCDF3_CLASSIC", "hdf5"])
+@pytest.mark.parametrize("case", list(CASES))
+def test_packed_numbers_become_the_values_that_the_conventions_give(tmp_path, case, form):
+    stored, attributes, wanted = CASES[case]
+    if (form, case) == ("NETCDF3_CLASSIC", "signed"):
+        pytest.skip("this format has no unsigned type")
+    path = tmp_path / ("log.h5" if form == "hdf5" else "log.nc")
+    raw = read_log(write(path, stored, dict(attributes), form=form))
+    np.testing.assert_allclose(raw.rate.values[0], wanted, rtol=1e-12, atol=0.0)
+    assert raw.attrs["unreadable_cells"] == np.isnan(wanted).sum()
+
+
+@pytest.mark.filterwarnings("ignore:variable 'gyro_x' has multiple fill values")
+@pytest.mark.parametrize("case", ["scale and offset", "several missing", "unsigned, packed", "signed"])
+def test_packed_numbers_become_the_values_that_xarray_gives(tmp_path, case):
+    stored, attributes, _ = CASES[case]
+    path = write(tmp_path / "log.nc", stored, dict(attributes))
+    raw = read_log(path)
+    with xr.open_dataset(path, decode_times=False) as decoded:
+        np.testing.assert_allclose(raw.rate.values[0], decoded["gyro_x"].values, rtol=1e-6)
+
+
+TIMES = {
+    "counts": ({"scale_factor": 0.5}, 0.5, 0.0),
+    "range in packed units": ({"scale_factor": 0.01, "valid_range": np.array([0, ROWS - 1], "i4")}, 0.01, 0.0),
+    "range in unpacked units": ({"scale_factor": 0.01, "valid_range": np.array([0.0, 0.59])}, 0.01, 0.0),
+    "offset": ({"scale_factor": 0.01, "add_offset": 1_767_225_600.0, "units": "Seconds Since 1970-01-01"}, 0.01, 1_767_225_600.0),
+    "no whole nanoseconds": ({"scale_factor": 1 / 3, "add_offset": 10.0}, 1 / 3, 10.0),
+}
+
+
+@pytest.mark.parametrize("case", list(TIMES))
+@pytest.mark.parametrize("suffix", [".nc", ".h5"])
+def test_packed_stamps_keep_every_row(tmp_path, case, suffix):
+    attributes, step, start = TIMES[case]
+    raw = read_log(write(tmp_path / f"log{suffix}", COUNTS, {}, time=dict(attributes)))
+    wanted = np.rint((start + step * np.arange(ROWS)) * 1e9)
+    np.testing.assert_allclose(raw.time.values.astype(np.int64), wanted, atol=300.0 if start > 1e9 else 1.0, rtol=0.0)
+
+
+def test_whole_counts_stay_whole_on_the_grid(tmp_path):
+    raw = read_log(write(tmp_path / "log.nc", BYTES.view("i1"), {"_Unsigned": "true", "scale_factor": 0.5, "_FillValue": np.int8(-97)}))
+    assert raw.rate.encoding == {"dtype": np.dtype("int16"), "scale_factor": 0.5}
+
+
+@pytest.mark.parametrize(
+    "attributes", [{"scale_factor": 0.0}, {"scale_factor": "0.1"}, {"add_offset": np.nan}, {"valid_range": np.arange(3)}]
+)
+def test_an_attribute_without_a_usable_value_is_refused_by_name(tmp_path, attributes):
+    with pytest.raises(FormatError, match=rf"log.nc: variable 'gyro_x': .*{next(iter(attributes))}"):
+        read_log(write(tmp_path / "log.nc", COUNTS, attributes))
+
+
+def test_counts_beyond_the_digits_of_a_float_are_compared_exactly():
+    large = np.array([2**62, 2**62 + 1], dtype="i8")
+    packing = Packing.from_attributes("x", large.dtype, {"_FillValue": large[0]})
+    assert np.ma.getmaskarray(packing.read_counts(large)).tolist() == [True, False]

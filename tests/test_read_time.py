@@ -1,0 +1,170 @@
+"""Stamps in every format: what can be read in one way only is read exactly, and everything else is refused or counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cf_units
+import cftime
+import h5py
+import netCDF4
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from gyrostab.errors import FormatError, OptionError, UnitError
+from gyrostab.read import read_log, scan_file
+from gyrostab.read.stamps import NAT, dates_to_ns, integers_to_ns, parse_time_unit
+from gyrostab.timegrid import stamp_ns
+
+ROWS = 40
+
+
+def write_stamped(path: Path, stamps: np.ndarray, **attributes: Any) -> Path:
+    """NetCDF or HDF5 with one axis, and stamps with these attributes."""
+    if path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file["time"] = stamps
+            file["time"].attrs.update(attributes)
+            file["gyro_x"] = np.arange(ROWS)
+            file["gyro_x"].attrs["units"] = "deg/h"
+        return path
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("obs", ROWS)
+        for name, values, attrs in (("time", stamps, attributes), ("gyro_x", np.arange(ROWS), {"units": "deg/h"})):
+            variable = file.createVariable(name, values.dtype, ("obs",))
+            variable.setncatts(attrs)
+            variable[:] = values
+    return path
+
+
+def dates(year: int, unit: str = "us") -> np.ndarray:
+    return np.datetime64(f"{year}-05-06", unit) + np.arange(ROWS) * np.timedelta64(10**6, "us").astype(f"timedelta64[{unit}]")
+
+
+def write_dates(path: Path, stamps: np.ndarray, unit: str = "us") -> Path:
+    if path.suffix == ".csv":
+        rows = "\n".join(f"{stamp}Z,{row}" for row, stamp in enumerate(stamps))
+        path.write_text(f"time,gyro_x [deg/h]\n{rows}\n")
+    else:
+        parquet.write_table(pa.table({"time": pa.array(stamps, pa.timestamp(unit)), "gyro_x [deg/h]": np.arange(len(stamps))}), path)
+    return path
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.parquet"])
+@pytest.mark.parametrize("year", [1500, 1677, 2263, 2300])
+def test_dates_that_nanoseconds_do_not_hold_are_counted_or_refused(tmp_path, name, year):
+    stamps = dates(2026)
+    stamps[7] = dates(year)[7]
+    raw = read_log(write_dates(tmp_path / name, stamps))
+    assert np.flatnonzero(np.isnat(raw.time.values)).tolist() == [7]
+    assert raw.attrs["unreadable_rows"] == 1
+    good = np.delete(np.arange(ROWS), 7)
+    np.testing.assert_array_equal(raw.time.values[good], stamps[good])
+    with pytest.raises(FormatError, match="1678 to 2262"):
+        read_log(write_dates(tmp_path / f"all_{name}", dates(year)))
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_dates_of_every_unit_of_parquet(tmp_path, unit):
+    stamps = dates(2026, unit)
+    raw = read_log(write_dates(tmp_path / "log.parquet", stamps, unit))
+    np.testing.assert_array_equal(raw.time.values, stamps)
+    zoned = pa.array(stamps, pa.timestamp(unit, tz="Europe/Berlin"))  # the stored numbers are UTC
+    parquet.write_table(pa.table({"time": zoned, "gyro_x [deg/h]": np.arange(ROWS)}), tmp_path / "zoned.parquet")
+    np.testing.assert_array_equal(read_log(tmp_path / "zoned.parquet").time.values, stamps)
+
+
+@pytest.mark.parametrize("unit", ["D", "s", "ms", "us", "ns", "Y"])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_dates_are_never_wrapped_around(unit, order):
+    stamps = np.array(["1500-01-01", "2026-01-01", "2300-01-01", "NaT"], dtype="datetime64[s]").astype(f"{order}M8[{unit}]")
+    wanted = [NAT, 1_767_225_600 * 10**9, NAT, NAT] if unit != "ns" else dates_to_ns(stamps)[:].tolist()
+    assert dates_to_ns(stamps).tolist() == wanted
+
+
+SAME_INSTANT = [
+    "Seconds Since 2026-01-02 03:04:05", "SECONDS SINCE 2026-01-02 03:04:05", "sec since 2026-1-2 3:4:5.0", "s since 2026-01-02T03:04:05Z",
+    "second since 2026-01-02 03:04:05 UTC", "seconds since 2026-01-02 04:34:05 +1:30", "seconds since 20260102T030405",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", SAME_INSTANT)
+def test_epochs_are_read_as_udunits_reads_them(text):
+    unit = parse_time_unit(text)
+    assert unit.epoch == stamp_ns("2026-01-02T03:04:05")
+    assert cf_units.Unit(text).convert(0.0, cf_units.Unit("seconds since 1970-01-01")) == unit.epoch / 1e9
+
+
+@pytest.mark.parametrize("text", ["week", "days", "Hours", "min", "msec", "microseconds", "0.25 s", "1e-3 minutes"])
+def test_units_of_time_are_those_of_udunits(text):
+    assert float(parse_time_unit(text).ns) == pytest.approx(cf_units.Unit(text.lower()).convert(1e9, "s"), rel=1e-14)
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".h5"])
+@pytest.mark.parametrize(
+    "units",
+    ["seconds since now", "seconds since 01-02-2026", "seconds since 01/02/2026", "seconds since 2026-02-30", "seconds since yesterday",
+     "seconds since", "seconds since 26-01-02", "months since 2026-01-01", "seconds since 2026"],
+)  # fmt: skip
+def test_an_epoch_that_must_be_guessed_is_refused(tmp_path, units, suffix):
+    path = write_stamped(tmp_path / f"log{suffix}", np.arange(ROWS), units=units)
+    with pytest.raises(UnitError, match=rf"log{suffix}: column 'time': time unit '{units}'.*--unit \"time=seconds since"):
+        read_log(path)
+    assert any("time unit" in note for note in scan_file(path).notes)
+    given = read_log(path, unit={"time": "seconds since 2026-01-02"})
+    assert given.time.values[1] == np.datetime64("2026-01-02T00:00:01")
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".h5"])
+@pytest.mark.parametrize("calendar", ["noleap", "365_day", "all_leap", "366_day", "360_day", "none", "tai"])
+def test_calendars_without_real_dates_are_refused(tmp_path, calendar, suffix):
+    stamps = np.cumsum(np.random.default_rng(1).uniform(0.9, 1.1, ROWS))
+    path = write_stamped(tmp_path / f"log{suffix}", stamps, units="seconds since 2026-02-28", calendar=calendar)
+    with pytest.raises(UnitError, match=f"log{suffix}: column 'time': .*{calendar}.*standard calendar"):
+        read_log(path)
+
+
+@pytest.mark.parametrize("calendar", ["standard", "Gregorian", "proleptic_gregorian", "julian"])
+@pytest.mark.parametrize("epoch", ["2026-02-28 12:00:00", "1858-11-17", "1600-01-01", "0001-01-01"])
+def test_calendars_of_real_dates_are_converted(tmp_path, calendar, epoch):
+    year, month, day = map(int, epoch.split(" ")[0].split("-"))
+    begin = cftime.datetime(year, month, day, 12 if " " in epoch else 0, calendar=calendar.lower())
+    end = cftime.datetime(2026, 3, 1, 6, calendar="standard")
+    days = end.toordinal(fractional=True) - begin.toordinal(fractional=True)
+    microseconds = np.rint(days * 86400).astype(np.int64) * 10**6 + 10_000 * np.arange(ROWS)
+    raw = read_log(write_stamped(tmp_path / "log.nc", microseconds, units=f"microseconds since {epoch}", calendar=calendar))
+    np.testing.assert_array_equal(raw.time.values, np.datetime64("2026-03-01T06", "us") + microseconds - microseconds[0])
+
+
+@pytest.mark.parametrize("unit", ["ns", "us", "7 us", "0.1 s", "0.5 ns", "d", "seconds since 0001-01-01", "days since 9000-01-01"])
+def test_whole_numbers_become_exact_stamps_or_none(unit):
+    parsed = parse_time_unit(unit)
+    counts = np.array([0, 1, -1, 2**31, -(2**40), 62_900_000_000, 2**62, -(2**62), 2**63 - 1, -(2**63) + 1])
+    zero = parsed.epoch or 0
+    found = integers_to_ns(counts, parsed, 0)
+    for count, stamp in zip(counts.tolist(), found.tolist(), strict=True):
+        exact = count * parsed.ns + zero
+        if stamp != NAT:
+            assert abs(stamp - exact) <= 0.5
+        else:
+            assert abs(exact) > 2**61  # near the ends a stamp may be given up
+
+
+@pytest.mark.parametrize("option", ["start", "epoch"])
+@pytest.mark.parametrize(
+    "text", ["now", "today", "01-02-2026", "01/02/2026", "Jan 2 2026", "1500-01-01", "2300-01-01", "2026-02-30", "2026"]
+)
+def test_start_and_epoch_are_not_guessed(tmp_path, option, text):
+    path = tmp_path / "log.csv"
+    path.write_text("gyro_x [deg/h]\n1\n2\n")
+    with pytest.raises(OptionError, match=f"--{option} '{text}'.*(write|give)"):
+        read_log(path, rate=1.0, **{option: text})
+
+
+def test_an_epoch_that_is_not_used_is_said(tmp_path):
+    raw = read_log(write_stamped(tmp_path / "log.nc", np.arange(ROWS), units="seconds since 2026-01-02"), epoch="2020-01-01")
+    assert raw.time.values[0] == np.datetime64("2026-01-02")
+    assert any("--epoch is not used" in note for note in raw.attrs["notes"])
