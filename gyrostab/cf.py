@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
 from importlib import metadata
 from typing import Any
@@ -211,7 +212,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     """Turn what was opened without decoding times and without indexes into the dataset it was in memory; `where` is for messages."""
     bounds = {variable.attrs["bounds"]: name for name, variable in stored.variables.items() if "bounds" in variable.attrs}
     variables: dict[Any, xr.Variable] = {}
-    grids = declared_grids(stored)
+    grids = declared_grids(stored, where)
     axes, close = _axes(stored, grids, where), stored._close
     dims: dict[Any, Any] = {index_dim(rule["dim"]): rule["dim"] for rule in grids.values()}
     for name, variable in stored.variables.items():
@@ -256,9 +257,29 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
     return decoded.astype("datetime64[ns]")
 
 
-def declared_grids(stored: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """The rules of the computed time axes that a file declares: name of the variable -> rule."""
-    return {str(name): json.loads(variable.attrs[GRID]) for name, variable in stored.variables.items() if GRID in variable.attrs}
+def declared_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, Any]]:
+    """The rules of the computed time axes that a file declares: name of the variable -> rule; `where` is for messages."""
+    declared = {str(name): variable.attrs[GRID] for name, variable in stored.variables.items() if GRID in variable.attrs}
+    try:
+        return {name: _parse_grid(text) for name, text in declared.items()}
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"{where}: the rule of its time axis, attribute {GRID!r}, is damaged ({error}); copy it again") from error
+
+
+def _parse_grid(text: Any) -> dict[str, Any]:
+    """The rule of a time axis; `ValueError` when it is not one that `to_disk` writes."""
+    rule = json.loads(text)
+    kinds = {"dim": str, "size": int, "start_ns": int, "first": int, "stride": int, "rate_hz": int | float}
+    wrong = [name for name, kind in kinds.items() if not isinstance(rule, dict) or not isinstance(rule.get(name), kind)]
+    if wrong:
+        raise ValueError(f"no {' and no '.join(wrong)}")
+    first, last = (rule["first"] + rule["stride"] * n for n in (0, max(rule["size"], 1) - 1))
+    spans = (rule["start_ns"] + n * 1e9 / rule["rate_hz"] for n in (first, last)) if rule["rate_hz"] > 0 else ()
+    if not (rule["rate_hz"] > 0 and math.isfinite(rule["rate_hz"]) and rule["size"] >= 0 and rule["stride"] != 0):
+        raise ValueError(f"{text}")
+    if any(abs(stamp) >= 2.0**63 for stamp in spans):
+        raise ValueError("it leaves the years 1678 to 2262")
+    return dict(rule)
 
 
 def _axes(stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str) -> dict[str, xr.Coordinates]:

@@ -6,7 +6,14 @@ A message says what was read (file, line or time), what is wrong with it and wha
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+
 __all__ = [
+    "DamageError",
     "FormatError",
     "GyrostabError",
     "MissingUnitError",
@@ -17,7 +24,14 @@ __all__ = [
     "TimeError",
     "UnitError",
     "WorkerError",
+    "reading_of",
 ]
+
+#: Errors of the operating system that concern the process or the path, not the content of a file.
+_SYSTEM_ERRNOS = (
+    errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EINTR, errno.EISDIR, errno.ELOOP, errno.EMFILE, errno.ENAMETOOLONG, errno.ENFILE,
+    errno.ENOENT, errno.ENOMEM, errno.ENOSPC, errno.ENOTDIR, errno.EPERM, errno.ESTALE,
+)  # fmt: skip
 
 
 class GyrostabError(Exception):
@@ -26,6 +40,10 @@ class GyrostabError(Exception):
 
 class FormatError(GyrostabError, ValueError):
     """A file cannot be read as the format it claims to be, or holds no usable rows."""
+
+
+class DamageError(FormatError):
+    """A library failed while it read a file; ``__cause__`` is the exception that it raised."""
 
 
 class UnitError(GyrostabError, ValueError):
@@ -58,3 +76,47 @@ class ResumeError(GyrostabError, ValueError):
 
 class WorkerError(GyrostabError, RuntimeError):
     """The processes that were to do the work cannot be reached, cannot see the files, or have died."""
+
+
+@contextmanager
+def reading_of(path: str | PathLike[str]) -> Iterator[None]:
+    """Turn whatever a library raises while it reads a file into a `DamageError` that names the file.
+
+    Format libraries raise exceptions of any type on damaged bytes. Each entry to a file (opening it, and every later read of data
+    that stayed on disk) runs within this context, so that no caller has to know those types.
+
+    Parameters
+    ----------
+    path : path-like
+        File or directory that is read.
+
+    Raises
+    ------
+    DamageError
+        When the block raises anything but a `GyrostabError` or an error of the operating system, such as a missing permission.
+
+    Examples
+    --------
+    >>> with reading_of("/data/log.nc"):
+    ...     raise RuntimeError("NetCDF: HDF error")
+    Traceback (most recent call last):
+    gyrostab.errors.DamageError: log.nc: is damaged, or not of its format (RuntimeError: NetCDF: HDF error); copy it again
+    """
+    try:
+        yield
+    except GyrostabError:
+        raise
+    except OSError as error:
+        if error.errno in _SYSTEM_ERRNOS:
+            raise
+        raise _describe_damage(path, error) from error
+    except Exception as error:
+        raise _describe_damage(path, error) from error
+
+
+def _describe_damage(path: str | PathLike[str], error: Exception) -> DamageError:
+    name, text = Path(path).name, " ".join(str(error).split())
+    if isinstance(error, MemoryError):
+        return DamageError(f"{name}: reading it takes more memory than there is{f' ({text})' if text else ''}; is it damaged?")
+    reason = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return DamageError(f"{name}: is damaged, or not of its format ({reason:.300}); copy it again")

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.cf import from_disk, index_dim, to_disk
-from gyrostab.errors import FormatError, OptionError, SchemaError
+from gyrostab.errors import FormatError, OptionError, SchemaError, reading_of
 from gyrostab.output import new_output
 from gyrostab.schema import check_log, check_product, check_surface
 from gyrostab.store import (
@@ -280,7 +280,8 @@ def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
     ...
     gyrostab.errors.FormatError: nothing.nc: there is no such file
     """
-    return from_disk(open_stored(Path(path), strict=strict), str(path))
+    with reading_of(path):
+        return from_disk(open_stored(Path(path), strict=strict), str(path))
 
 
 def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -377,7 +378,8 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
 def _open(path: str | os.PathLike[str], what: str, check: Any, advice: str, *, strict: bool = False) -> xr.Dataset:
     dataset = open_dataset(path, strict=strict)
     try:
-        check(dataset)
+        with reading_of(path):
+            check(dataset)
     except SchemaError as error:
         dataset.close()
         raise FormatError(f"{path}: does not hold {what} ({error}); {advice}") from error

@@ -10,9 +10,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from gyrostab.errors import FormatError, OutputError
+from gyrostab.errors import OutputError
 
-__all__ = ["damaged_input", "make_folder", "new_output"]
+__all__ = ["make_folder", "new_output"]
 
 #: Looks, 20 ms apart, after which what has gone stays gone: a busy machine may hold a thread up that long.
 _LOOKS = 15
@@ -40,8 +40,6 @@ def new_output(path: str | os.PathLike[str], *, overwrite: bool = False, directo
     ------
     OutputError
         When `path` exists and `overwrite` is not given, or when the block fails to write.
-    FormatError
-        When the block fails to read the NetCDF file that it draws on.
 
     Examples
     --------
@@ -73,8 +71,6 @@ def new_output(path: str | os.PathLike[str], *, overwrite: bool = False, directo
     except (OSError, RuntimeError) as error:
         if isinstance(error, OutputError) or (isinstance(error, RuntimeError) and not str(error).startswith("NetCDF:")):
             raise
-        if damaged := damaged_input(error):
-            raise FormatError(f"{damaged}: is damaged ({error}); make or copy it again") from error
         raise OutputError(f"{path}: cannot be written: {_reason(error, path)}") from error
     finally:
         _remove(temporary)
@@ -122,18 +118,6 @@ def _remove(path: Path) -> None:
         if gone == _LOOKS:
             return
         time.sleep(0.02)
-
-
-def damaged_input(error: Exception) -> str | None:
-    """The NetCDF file that was being read when the library failed, which says no more than "HDF error"; None while writing."""
-    frame = error.__traceback__
-    while frame is not None:
-        code = frame.tb_frame.f_code
-        if code.co_name == "_getitem" and code.co_filename.endswith("netCDF4_.py"):
-            wrapper = frame.tb_frame.f_locals.get("self")
-            return str(getattr(getattr(wrapper, "datastore", None), "_filename", "the NetCDF file that is read"))
-        frame = frame.tb_next
-    return None
 
 
 def _reason(error: Exception, path: Path) -> str:

@@ -10,8 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.errors import FormatError, GyrostabError
-from gyrostab.output import damaged_input
+from gyrostab.errors import GyrostabError
 
 __all__ = ["COLUMNS", "print_scan", "scan"]
 
@@ -63,11 +62,6 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
         except GyrostabError as error:
             errors.append(error)
             rows.append({"file": str(path), "odd": str(error)})
-        except RuntimeError as error:  # a log that gyrostab wrote is read when it is used
-            if not damaged_input(error):
-                raise
-            errors.append(FormatError(f"{path}: is damaged ({error}); make or copy it again"))
-            rows.append({"file": str(path), "odd": str(errors[-1])})
     if errors and len(errors) == len(names):
         raise errors[0]
     return pd.DataFrame(rows, columns=list(COLUMNS))

@@ -281,7 +281,7 @@ def test_damage_in_the_midst_of_the_data_is_no_fault_of_ours(tmp_path: Path, suf
     whole[place : place + 300] = b"\xff" * 300
     path.write_bytes(bytes(whole))
     given = {} if suffix == ".parquet" else {"time": "s", "gyro": "deg/h"}
-    with pytest.raises(FormatError, match=rf"log{suffix}: is damaged .*copy it again"):
+    with pytest.raises(FormatError, match=rf"log{suffix}: is damaged, .*copy it again"):
         read_log(path, unit=given)
 
 

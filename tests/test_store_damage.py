@@ -16,11 +16,12 @@ from numcodecs import Blosc
 import gyrostab
 import gyrostab.store.layout as layout_module
 import gyrostab.store.read as read_module
-from gyrostab.errors import FormatError
-from gyrostab.export import open_log, to_zarr
+from gyrostab.errors import DamageError, FormatError
+from gyrostab.export import open_log, open_product, to_netcdf, to_zarr
 from gyrostab.store.direct import fill_row
 from gyrostab.timegrid import time_coordinate
 
+from . import synthetic
 from .stored import CHUNK, START, WRITERS, counts_log, same_bits, spoil
 
 
@@ -176,5 +177,23 @@ def test_what_stands_behind_a_chunk_that_is_cut_short_is_not_read():
     packed = Blosc("lz4").encode(np.random.default_rng(1).integers(0, 9, 10_000))
     codecs = layout_module.zarr_codecs({"compressor": Blosc("lz4").get_config(), "filters": None})
     assert layout_module.decoded_chunk(packed, codecs, np.dtype("i8")).size == 10_000
-    with pytest.raises(RuntimeError, match="it is cut short"):
+    with pytest.raises(layout_module.ChunkDamage, match="it is cut short"):
         layout_module.decoded_chunk(memoryview(packed)[:-1], codecs, np.dtype("i8"))
+
+
+def test_a_library_that_fails_in_a_late_read_names_the_file(tmp_path):
+    """A product is read when it is used; the error of the library is then one of the file, whoever asks and wherever it is written."""
+    product = synthetic.product(windows=400)
+    path = to_netcdf(product, tmp_path / "product.nc")
+    with h5py.File(path) as stored:
+        chunk = stored["avar"].id.get_chunk_info(0)
+    data = bytearray(path.read_bytes())
+    data[chunk.byte_offset + chunk.size // 2] ^= 0x10
+    path.write_bytes(bytes(data))
+    with open_product(path) as opened:
+        with pytest.raises(DamageError, match=r"product\.nc: is damaged") as raised:
+            opened["avar"].mean().compute()
+        assert isinstance(raised.value.__cause__, RuntimeError)
+        with pytest.raises(DamageError, match=r"product\.nc: is damaged"):
+            to_netcdf(opened, tmp_path / "copy.nc")
+    assert not (tmp_path / "copy.nc").exists()

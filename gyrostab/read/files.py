@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import glob
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import replace
 from functools import cache, partial
 from importlib.metadata import entry_points
@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 
 import xarray as xr
 
-from gyrostab.errors import FormatError, GyrostabError, OptionError
+from gyrostab.errors import FormatError, GyrostabError, OptionError, reading_of
 from gyrostab.join import join_logs, log_span
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
@@ -133,28 +133,13 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
     """
     path = Path(path)
     reader = _reader(path)
-    with _damage_named(path):
+    with reading_of(path):
         return reader.scan(path, options or ReadOptions())
-
-
-@contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    """Make a `FormatError` of what the format libraries say when they come upon damaged bytes in the midst of a file."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, GyrostabError) or error.errno is not None:
-            raise
-        raise FormatError(f"{path.name}: is damaged ({error}); copy it again") from error
-    except RuntimeError as error:
-        if not str(error).startswith("NetCDF:"):
-            raise
-        raise FormatError(f"{path.name}: is damaged ({error}); copy it again") from error
 
 
 def _read(path: Path, options: ReadOptions) -> xr.Dataset:
     reader = _reader(path)
-    with _damage_named(path):
+    with reading_of(path):
         return reader.read(path, options)
 
 
@@ -307,7 +292,7 @@ def _ahead(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None) 
 
 def _read_text(path: Path, options: ReadOptions, stop: Event) -> xr.Dataset:
     reader = _registered()["text"].load()
-    with _damage_named(path):
+    with reading_of(path):
         return cast(xr.Dataset, reader.read(path, options, stop=stop.is_set))
 
 

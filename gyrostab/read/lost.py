@@ -38,12 +38,12 @@ class LostFile:
 def is_damage(path: Path, error: Exception) -> bool:
     """Whether an error tells of one damaged or missing file, so that the others can be read all the same.
 
-    A wrong option, a missing unit, or a system without room or file handles is none.
+    A wrong option, a missing unit, or a system without room, memory or file handles is none.
     """
     if path.is_dir() and path.suffix.lower() != ".zarr":
         return False
     if isinstance(error, GyrostabError):
-        return isinstance(error, FormatError)
+        return isinstance(error, FormatError) and not isinstance(error.__cause__, MemoryError)
     return isinstance(error, OSError) and error.errno not in _SYSTEM
 
 

@@ -24,7 +24,7 @@ from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.read.packing import Decoder, fold_packing, text_attributes
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
-from gyrostab.store import open_stored, stored_attribute
+from gyrostab.store import name_file, open_stored, stored_attribute
 from gyrostab.timegrid import grid_times, time_coordinate
 from gyrostab.units import ON_DISK
 
@@ -102,7 +102,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
         if path.is_dir():
             raise FormatError(f"{path.name}: this Zarr store is no gyrostab log (axis and time, attribute sampling_rate_hz)")
         return None
-    log = xr.decode_cf(stored.chunk())  # an index would hold every stamp in memory
+    log = xr.decode_cf(_chunked(name_file(stored, path)))  # an index would hold every stamp in memory
     if path.is_dir():
         log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
     log.set_close(stored.close)
@@ -122,13 +122,21 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     return _rebuild_time(path, log)
 
 
+def _chunked(stored: xr.Dataset) -> xr.Dataset:
+    """The dataset as arrays of dask, in the chunks of the file."""
+    chunks: dict[Any, int] = {}
+    for variable in stored.variables.values():
+        chunks |= variable.encoding.get("preferred_chunks", {})
+    return stored.chunk(chunks)
+
+
 def _content(path: Path) -> str:
     """What it says that gyrostab wrote it as: log, surface or product; what is damaged as a whole, or another's, says nothing."""
     try:
         if path.is_dir():
             return str(json.loads((path / ".zattrs").read_text()).get("gyrostab_content", ""))
         return stored_attribute(path, "gyrostab_content")
-    except (OSError, RuntimeError, ValueError, AttributeError):
+    except Exception:  # whatever the libraries raise on damaged bytes
         return ""
 
 

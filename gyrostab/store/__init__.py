@@ -7,6 +7,7 @@ gives back the same doubles. A chunk that is missing or damaged becomes a gap, a
 from gyrostab.store.deflate import append_deflated, large_variables
 from gyrostab.store.layout import stored_attribute
 from gyrostab.store.lock import library_lock
+from gyrostab.store.named import name_file
 from gyrostab.store.read import open_stored
 from gyrostab.store.write import Misfit, Progress, append_netcdf, append_zarr, as_counts, chunk_samples, common_packing, long_variables
 
@@ -22,6 +23,7 @@ __all__ = [
     "large_variables",
     "library_lock",
     "long_variables",
+    "name_file",
     "open_stored",
     "stored_attribute",
 ]

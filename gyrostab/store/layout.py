@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.checksum import fletcher32
 from gyrostab.store.lock import library_lock
 
@@ -78,7 +78,7 @@ def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:
         return not any(encoding.get(filters) for filters in ("szip", "bzip2", "blosc"))
     try:
         return bool(json.loads((path / name / ".zarray").read_text())["order"] == "C")
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         return False
 
 
@@ -116,18 +116,18 @@ def _hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> N
     try:
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         try:
-            data: Any = _bytes_at(handle, begin, size)
+            if begin + size > os.fstat(handle).st_size:  # before memory is taken: a damaged index may hold any number
+                raise ChunkDamage("is missing: the file is cut short")
+            data = _bytes_at(handle, begin, size)
         finally:
             os.close(handle)
-        if len(data) < size:
-            raise ChunkDamage("is missing: the file is cut short")
-        return decoded_chunk(data, [codec for number, codec in layout.codecs if not mask >> number & 1], layout.dtype)
     except OSError as error:
-        if error.errno not in (None, errno.EIO):
+        if error.errno != errno.EIO:
             raise FormatError(f"{path}: cannot be opened again ({error.strerror}); has it been moved or changed?") from error
         raise ChunkDamage(f"is damaged: {error}") from error
-    except (RuntimeError, ValueError) as error:
-        raise ChunkDamage(f"is damaged: {' '.join(str(error).split())}") from error
+    if len(data) < size:
+        raise ChunkDamage("is missing: the file is cut short")
+    return decoded_chunk(data, [codec for number, codec in layout.codecs if not mask >> number & 1], layout.dtype)
 
 
 def _bytes_at(handle: int, begin: int, size: int) -> bytes:
@@ -145,22 +145,23 @@ def _hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
 
     places: dict[tuple[int, ...], tuple[int, int, int]] = {}
     damage = ""
-    with library_lock():
+    with library_lock(), reading_of(path):
         try:
-            with h5py.File(path, "r") as file:
-                variable = file[name]
-                dtype, codecs = variable.dtype, _hdf5_codecs(variable.id.get_create_plist())
-
-                def note(chunk: Any) -> None:
-                    number = tuple(at // length for at, length in zip(chunk.chunk_offset, variable.chunks, strict=True))
-                    places[number] = (chunk.byte_offset, chunk.size, chunk.filter_mask)
-
-                try:
-                    variable.id.chunk_iter(note)
-                except (RuntimeError, ValueError) as error:
-                    damage = f"the index of {name} cannot be read ({error})"
-        except (OSError, KeyError) as error:
+            file = h5py.File(path, "r")
+        except OSError as error:
             raise FormatError(f"{path}: cannot be opened again ({error}); has it been moved or changed?") from error
+        with file:
+            variable = file[name]
+            dtype, codecs, lengths = variable.dtype, _hdf5_codecs(variable.id.get_create_plist()), variable.chunks or ()
+
+            def note(chunk: Any) -> None:
+                number = tuple(at // length for at, length in zip(chunk.chunk_offset, lengths, strict=True))
+                places[number] = (chunk.byte_offset, chunk.size, chunk.filter_mask)
+
+            try:
+                variable.id.chunk_iter(note)
+            except Exception as error:  # h5py raises errors of many kinds on a damaged index
+                damage = f"the index of {name} cannot be read ({error})"
     return _Hdf5Layout(dtype, codecs, places, damage)
 
 
@@ -211,15 +212,16 @@ def _zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]
     layout = _zarr_layout(folder, opened)
     name = layout.separator.join(map(str, place))
     try:
-        return decoded_chunk((folder / name).read_bytes(), layout.codecs, layout.dtype)
+        data = (folder / name).read_bytes()
     except FileNotFoundError as error:
         if not folder.is_dir():
             raise FormatError(f"{folder}: is not there any more; has it been moved or removed?") from error
         raise ChunkDamage(f"is missing: no file {folder.name}/{name}") from error
-    except (OSError, RuntimeError, ValueError) as error:
-        if isinstance(error, OSError) and error.errno not in (None, errno.EIO):
+    except OSError as error:
+        if error.errno != errno.EIO:
             raise FormatError(f"{folder / name}: cannot be read ({error.strerror})") from error
-        raise ChunkDamage(f"is damaged: {folder.name}/{name}: {' '.join(str(error).split())}") from error
+        raise ChunkDamage(f"is damaged: {folder.name}/{name}: {error}") from error
+    return decoded_chunk(data, layout.codecs, layout.dtype, name=f"{folder.name}/{name}: ")
 
 
 @lru_cache(maxsize=_REMEMBERED)
@@ -227,9 +229,11 @@ def _zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
     """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk."""
     try:
         layout = json.loads((folder / ".zarray").read_text())
+        return _ZarrLayout(np.dtype(layout["dtype"]), zarr_codecs(layout), str(layout.get("dimension_separator", ".")))
     except OSError as error:
         raise FormatError(f"{folder}: is not there any more ({error.strerror}); has it been moved or removed?") from error
-    return _ZarrLayout(np.dtype(layout["dtype"]), zarr_codecs(layout), layout.get("dimension_separator", "."))
+    except Exception as error:  # whatever json, numpy and numcodecs raise on damaged text
+        raise FormatError(f"{folder / '.zarray'}: is damaged ({type(error).__name__}: {error}); copy it again") from error
 
 
 def zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
@@ -241,8 +245,19 @@ def zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(known[item["id"]]() if item["id"] in known else numcodecs.get_codec(item) for item in described)
 
 
-def decoded_chunk(data: Any, codecs: Iterable[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Bytes of a chunk, through the codecs, as numbers."""
-    for codec in codecs:
-        data = codec.decode(data)
-    return np.frombuffer(data, dtype)
+def decoded_chunk(data: Any, codecs: Iterable[Any], dtype: np.dtype[Any], *, name: str = "") -> NDArray[Any]:
+    """Bytes of a chunk, through the codecs, as numbers.
+
+    Raises
+    ------
+    ChunkDamage
+        When that fails; the message begins with `name`.
+    """
+    try:
+        for codec in codecs:
+            data = codec.decode(data)
+        return np.frombuffer(data, dtype)
+    except ChunkDamage:
+        raise
+    except Exception as error:  # codecs raise errors of many kinds on damaged bytes
+        raise ChunkDamage(f"is damaged: {name}{' '.join(str(error).split())}") from error

@@ -17,11 +17,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.cf import declared_grids, decode_stamps, index_dim
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.counts import from_counts
 from gyrostab.store.direct import with_fill
 from gyrostab.store.header import SMALL, Header, read_header
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
+from gyrostab.store.named import name_file
 from gyrostab.timegrid import grid_times
 
 __all__ = ["open_stored"]
@@ -47,6 +48,11 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     """
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
+    with reading_of(path):
+        return _open(path, strict=strict)
+
+
+def _open(path: Path, *, strict: bool) -> xr.Dataset:
     header = read_header(path)
     if header is not None:
         stored = _decoded(header)
@@ -57,11 +63,12 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
         stored = xr.open_dataset(path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False)
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+    except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise FormatError(f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again") from error
     if "gyrostab_version" not in stored.attrs:
         stored.close()
         raise FormatError(f"{path}: is {name}, but not one that gyrostab wrote; read it with gyrostab.read_log (gyrostab ingest)")
+    stored = name_file(stored, path)
     is_log = stored.attrs.get("gyrostab_content") == "log"
     long = _long_variables(stored, path, strict=strict) if is_log else {}
     opened = _lazy(stored, long, small=SMALL if is_log else 0)
@@ -117,7 +124,7 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
             length=int(chunks[-1]),
             scale=disk.get("scale_factor"),
             missing=disk.get("_FillValue"),
-            spans=_spans(stored, dim, int(chunks[-1])),
+            spans=_spans(stored, dim, int(chunks[-1]), path),
             strict=strict,
             opened=opened,
             zarr=path.is_dir(),
@@ -131,9 +138,9 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
     return long
 
 
-def _spans(stored: xr.Dataset, dim: str, length: int) -> dict[str, Any] | tuple[tuple[int, int], ...]:
+def _spans(stored: xr.Dataset, dim: str, length: int, path: Path) -> dict[str, Any] | tuple[tuple[int, int], ...]:
     """The rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
-    rules = {index_dim(rule["dim"]): rule for rule in declared_grids(stored).values()}
+    rules = {index_dim(rule["dim"]): rule for rule in declared_grids(stored, path).values()}
     if dim in rules:
         return rules[dim]
     if dim not in stored.variables:
