@@ -14,7 +14,7 @@ from gyrostab.read.layout import BLANK, Layout, is_number, split_line
 from gyrostab.read.options import ReadOptions
 from gyrostab.read.stamps import NAT, TimeUnit, cells_to_ns, integers_to_ns
 
-__all__ = ["Typing", "parse_cells", "parse_fast", "parse_plain", "stamp_types"]
+__all__ = ["VOID", "Typing", "parse_cells", "parse_fast", "parse_plain", "stamp_types"]
 
 #: Cells that mean "no value"; other words are unreadable.
 VOID = ("", "nan", "NaN", "NAN", "-nan", "null", "NULL", "NA", "N/A", "None")

@@ -28,6 +28,7 @@ from gyrostab.read.headers import (
     unit_quantity,
 )
 from gyrostab.read.options import ColumnSummary, ReadOptions
+from gyrostab.read.preset import Found, find_preset
 from gyrostab.read.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.units import INNER, known_units, parse_unit
 
@@ -61,6 +62,7 @@ class Plan:
     notes: tuple[str, ...]
     problems: tuple[GyrostabError, ...]
     unmatched: tuple[str, ...]
+    rate: float | None = None  # [Hz], where the lines above the header tell it and there is no time column
 
     def check(self) -> Plan:
         """Raise the first problem, if there is one."""
@@ -87,7 +89,8 @@ def plan_columns(
     calendars: Mapping[int, str] | None = None,
     stamped: Collection[int] = (),
     rising: Callable[[int], bool] | None = None,
-    presets: Mapping[int, str] | None = None,
+    above: Sequence[str] = (),
+    is_filled: Callable[[int], bool] | None = None,
 ) -> Plan:
     """Decide what each column is.
 
@@ -107,23 +110,30 @@ def plan_columns(
         Columns whose values are dates already (ISO 8601 text, datetime types).
     rising : callable, optional
         Says of a column whether its first values rise; it decides between several columns that look like the time.
-    presets : mapping of int to str, optional
-        What columns are in files of a known program, in the form of ``--map``; what the user says is stronger.
+    above : sequence of str
+        Lines above the header, which may tell the program that wrote the file.
+    is_filled : callable, optional
+        Says of a column whether its first cells hold anything.
 
     Returns
     -------
     Plan
         Nothing is raised here; ``Plan.check()`` raises what is wrong.
     """
+    preset = _known_program(path, headers, above, is_filled)
     work = _Work(path, options, rising or (lambda source: True))
-    named = work.name(headers, units or {}, calendars or {}, frozenset(stamped), presets or {})
+    named = work.name(headers, units or {}, calendars or {}, frozenset(stamped), preset.columns)
     named = work.separate(named)
     time = work.find_time(named)
     rest = [column for column in named if column is not time]
     gyro = [column for column in rest if AXIS.match(column.low)]
     signal, kind = work.plan_gyro(gyro, headers)
     work.plan_channels([column for column in rest if column not in gyro])
-    if time is None and options.rate is None and not work.problems:
+    rate = preset.rate if time is None and options.rate is None else None
+    if preset.name:
+        told = f", and {rate:g} Hz by the lines above the header" if rate else ""
+        work.notes.insert(0, f"read as a file of {preset.name}{told}; --map, --unit and --rate overrule it")
+    if time is None and options.rate is None and rate is None and not work.problems:
         message = f"{path.name}: there is no time column; give the sampling rate with --rate HZ (and --start)"
         work.problems.append(OptionError(f"{message}, or name the column: --map NAME=time. Columns: {_listing(headers)}"))
     work.finish(headers)
@@ -131,7 +141,15 @@ def plan_columns(
     unmatched = [f"--map {key}" for key in options.map if key not in work.used_map] + unused
     order = {"time": 0, "gyro": 1, "channel": 2}
     columns = sorted(work.columns, key=lambda column: (order[column.role], column.name if column.role == "gyro" else ""))
-    return Plan(path, tuple(columns), tuple(work.summaries), signal, kind, tuple(work.notes), tuple(work.problems), tuple(unmatched))
+    return Plan(path, tuple(columns), tuple(work.summaries), signal, kind, tuple(work.notes), tuple(work.problems), tuple(unmatched), rate)
+
+
+def _known_program(path: Path, headers: Sequence[str], above: Sequence[str], is_filled: Callable[[int], bool] | None) -> Found:
+    """The preset of a file, unless the file names its axes in our way."""
+    split = [(header, split_header(header)[0]) for header in headers]
+    if any(AXIS.match(name.lower()) for _, name in split):
+        return Found("")
+    return find_preset(path, split, above=above, is_filled=is_filled) or Found("")
 
 
 class _Work:

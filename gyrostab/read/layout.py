@@ -38,6 +38,7 @@ class Layout:
     samples: tuple[tuple[str, ...], ...]
     decimal_comma: bool = False
     notes: tuple[str, ...] = ()
+    above: tuple[str, ...] = ()  # lines above the header
 
     @property
     def width(self) -> int:
@@ -104,7 +105,8 @@ def find_layout(path: Path, head: bytes, *, complete: bool) -> Layout:
     if skipped:
         notes.append(f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line {skipped[0]})")
     comma = separator == ";" and _has_decimal_comma(rows)
-    return Layout(tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes))
+    top = tuple(lines[:above]) if header is not None else ()
+    return Layout(tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes), top)
 
 
 def _decode(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list[str]]:

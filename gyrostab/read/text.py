@@ -11,6 +11,7 @@ import re
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
+from dataclasses import replace
 from functools import partial
 from io import BufferedReader
 from pathlib import Path
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.read.buffers import SPILL_BYTES
-from gyrostab.read.cells import Typing, parse_cells, parse_fast, parse_plain, stamp_types
+from gyrostab.read.cells import VOID, Typing, parse_cells, parse_fast, parse_plain, stamp_types
 from gyrostab.read.columns import Column, Plan, plan_columns
 from gyrostab.read.intake import Intake, Taken, summary_of
 from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line
@@ -71,6 +72,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES, stop: Callable[[], bool] | None = None) -> xr.Dataset:
     """The raw log of a text file; see `gyrostab.read.read_log`. Ends with `CancelledError` where `stop` comes to be true."""
     layout, plan = _look(path, options)
+    options = options if plan.rate is None else replace(options, rate=plan.rate)
     intake = Intake(plan.check(), options, limit=limit)
     typing = Typing(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
@@ -90,7 +92,16 @@ def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
     stamped = [
         column for column in range(layout.width) if any(looks_iso(row[column]) for row in layout.samples if len(row) == layout.width)
     ]
-    return layout, plan_columns(path, layout.headers, options, stamped=stamped, rising=partial(_rises, layout))
+    plan = plan_columns(
+        path,
+        layout.headers,
+        options,
+        stamped=stamped,
+        rising=partial(_rises, layout),
+        above=layout.above,
+        is_filled=lambda column: any(row[column].strip() not in VOID for row in layout.samples if len(row) == layout.width),
+    )
+    return layout, plan
 
 
 def _rises(layout: Layout, column: int) -> bool:
