@@ -70,6 +70,7 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
 def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.read import ReadOptions, read_log, scan_file
     from gyrostab.regularise import gap_table, regularise
+    from gyrostab.regularise.fill import count_present
     from gyrostab.schema import log_channels, signal_name, texts
 
     max_gap = reading.get("max_gap", "10D")
@@ -77,7 +78,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
-    log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap=max_gap)
+    log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits"))
     start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
     gaps = gap_table(log)
     signal = log[signal_name(log)]
@@ -93,7 +94,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         "channels": " ".join(log_channels(log)),
         "rows": int(raw.sizes["time" if regular else "row"]),
         "gaps": len(gaps),
-        "missing_share": float(signal.isnull().mean()),
+        "missing_share": 1.0 - count_present(signal.data) / signal.size,
         "odd": "; ".join(notes),
     }
 

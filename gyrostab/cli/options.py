@@ -12,6 +12,7 @@ from cyclopts import Group, Parameter
 from cyclopts.validators import Number
 
 from gyrostab.errors import OptionError
+from gyrostab.limits import check_limits
 
 __all__ = ["ChannelFile", "Common", "Fitting", "Flag", "Reading", "Running", "Windows", "read_toml"]
 
@@ -48,6 +49,8 @@ class Reading:
         Longest gap; a longer step of the time stamps is taken for a step of the clock.
     strict
         Stop at a damaged or missing file instead of leaving a gap.
+    limit
+        Raise a limit that a message names: columns=50000. Repeat for more.
     """
 
     rate: Annotated[float | None, Parameter(metavar="HZ")] = None
@@ -59,6 +62,7 @@ class Reading:
     channel: Annotated[list[Path] | None, Parameter(metavar="FILE", negative=())] = None
     max_gap: Annotated[str, Parameter(metavar="DURATION")] = "10D"
     strict: Flag = False
+    limit: Annotated[list[str] | None, Parameter(metavar="NAME=NUMBER", negative=())] = None
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `gyrostab.run.load_log`."""
@@ -67,7 +71,9 @@ class Reading:
             "map": _pairs(self.map, "--map"),
             "unit": _pairs(self.unit, "--unit"),
             "channel": tuple(self.channel or ()),
+            "limits": check_limits(_pairs(self.limit, "--limit")),
         }
+        del chosen["limit"]
         return {name: value for name, value in chosen.items() if value not in (None, (), {}) and value is not False}
 
 
@@ -220,7 +226,7 @@ def _pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
     return found
 
 
-_PAIR_EXAMPLES = {"--map": "wx=gyro_x", "--unit": "gyro=deg/s"}
+_PAIR_EXAMPLES = {"--map": "wx=gyro_x", "--unit": "gyro=deg/s", "--limit": "columns=50000"}
 
 
 def read_toml(path: Path) -> dict[str, Any]:

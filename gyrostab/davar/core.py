@@ -248,7 +248,10 @@ def _work(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Cells (9, n_windows, n_tau), the last field the degrees of freedom, and means (2, n_windows) of one unit."""
     x = np.ascontiguousarray(x)
-    cells, means = surface_unit(x, unit, space)
+    if x.dtype.kind == "f" and np.isnan(x[[0, x.size // 2, -1]]).all() and np.isnan(x).all():
+        cells, means = (part.copy() for part in _empty_surface(_hashable(unit), x.size))
+    else:
+        cells, means = surface_unit(x, unit, space)
     scale = HOUR if unit.angle else 1.0  # angles are in degree, so their slopes in degree per second
     cells[0] *= scale**2
     dof = identify_noise(cells[0], cells[5], cells[6], cells[7], cells[3], *tables)
@@ -258,13 +261,26 @@ def _work(
 
 def _kept_tables(plan: Plan) -> tuple[Any, ...]:
     """`_noise_tables`, made once for all parts of a log."""
-    unit = plan.unit
-    return _tables_of(unit._replace(ks=tuple(unit.ks.tolist()), shifts=tuple(unit.shifts.tolist())), plan.rate)  # type: ignore[arg-type]
+    return _tables_of(_hashable(plan.unit), plan.rate)
 
 
 @lru_cache(maxsize=4)
 def _tables_of(unit: Unit, rate: float) -> tuple[Any, ...]:
-    return _noise_tables(unit._replace(ks=np.array(unit.ks, dtype=np.int64), shifts=np.array(unit.shifts, dtype=np.int64)), rate)
+    return _noise_tables(_with_arrays(unit), rate)
+
+
+@lru_cache(maxsize=4)
+def _empty_surface(unit: Unit, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what `surface_unit` makes of samples that are all missing: a long gap has many such units."""
+    return surface_unit(np.full(size, np.nan), _with_arrays(unit), None)
+
+
+def _hashable(unit: Unit) -> Unit:
+    return unit._replace(ks=tuple(unit.ks.tolist()), shifts=tuple(unit.shifts.tolist()))  # type: ignore[arg-type]
+
+
+def _with_arrays(unit: Unit) -> Unit:
+    return unit._replace(ks=np.array(unit.ks, dtype=np.int64), shifts=np.array(unit.shifts, dtype=np.int64))
 
 
 def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:

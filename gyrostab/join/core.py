@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,14 @@ import xarray as xr
 
 from gyrostab.clock import time_of_day
 from gyrostab.errors import TimeError, UnitError
-from gyrostab.gaps import gap_variables, name_lost
+from gyrostab.gaps import gap_variables, name_lost, stamp_text
 from gyrostab.join.channels import join_channels
 from gyrostab.join.gaps import join_gaps
 from gyrostab.join.grid import Piece, Source, log_span, source_of
 from gyrostab.join.lazy import chunk_of, lay
 from gyrostab.join.notes import some, together
 from gyrostab.join.place import place_logs
+from gyrostab.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
 from gyrostab.store import common_packing
 from gyrostab.timegrid import grid_times, time_coordinate
@@ -31,7 +32,12 @@ RATE_TOLERANCE = 1e-4
 
 
 def join_logs(
-    logs: Sequence[xr.Dataset], paths: Sequence[str | Path], *, max_gap: str | float = "10D", lost: Sequence[tuple[int, int]] = ()
+    logs: Sequence[xr.Dataset],
+    paths: Sequence[str | Path],
+    *,
+    max_gap: str | float = "10D",
+    lost: Sequence[tuple[int, int]] = (),
+    limits: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
     """Join regular logs along time, lazily.
 
@@ -46,6 +52,8 @@ def join_logs(
         A longer pause is a step of the clock, and the log that follows comes after one missing sample; a number is in seconds.
     lost : sequence of (int, int)
         First and last instant [ns since 1970] of files that cannot be read; the gaps there are of the cause "unreadable".
+    limits : mapping of str to float, optional
+        Limits of `gyrostab.limits` with other values; ``grid_samples`` bounds the samples of an axis.
 
     Returns
     -------
@@ -57,7 +65,7 @@ def join_logs(
     Raises
     ------
     TimeError
-        When the sampling rates differ by more than 100 parts per million.
+        When the sampling rates differ by more than 100 parts per million, or the common grid has far more samples than the logs.
     UnitError
         When the logs hold different kinds of signal, or a channel has different units.
 
@@ -78,6 +86,7 @@ def join_logs(
     rate = sources[0].rate
     start = int(grid_times(sources[0].start, rate, -pieces[0].first))
     size = max(piece.end for piece in pieces)
+    _check_grid(pieces, size, limits)
     name = signal_name(sources[0].log)
     chunk = chunk_of([source.log[name].data for source in sources])
     axes = sorted({axis for source in sources for axis in source.axes})
@@ -91,6 +100,20 @@ def join_logs(
     joined = xr.Dataset(variables, coordinates, _attributes(sources, size, [*notes, *_absent(sources, axes)]))
     joined.set_close(partial(_close, [log._close for log in logs if log._close is not None]))  # and nothing else of them
     return joined
+
+
+def _check_grid(pieces: Sequence[Piece], size: int, limits: Mapping[str, float] | None) -> None:
+    """Refuse a common grid that is out of proportion to the samples of the logs."""
+    if not is_absurd_grid(size, sum(piece.source.size for piece in pieces), limits):
+        return
+    ordered = sorted(pieces, key=lambda piece: piece.first)
+    widest = max(range(1, len(ordered)), key=lambda place: ordered[place].first - ordered[place - 1].end)
+    before, after = (ordered[place].source for place in (widest - 1, widest))
+    raise TimeError(
+        f"{before.name} ends at {stamp_text(before.end)} and {after.name} begins at {stamp_text(after.start)}: the grid of "
+        f"{before.rate:.10g} Hz would have {size:.4g} samples. Correct the time of one of them, or give a shorter --max-gap to take the "
+        f"pause for a clock step. If the pause is real: {describe_limit('grid_samples', size, limits)}"
+    )
 
 
 def _close(files: Sequence[Callable[[], None]]) -> None:

@@ -155,6 +155,7 @@ def read_log(
     channel: str | Path | Sequence[str | Path] = (),
     strict: bool = False,
     max_gap: str | float = "10D",
+    limits: Mapping[str, float] | None = None,
     on_file: OnFile | None = None,
 ) -> xr.Dataset:
     r"""Read one log or many as they were written.
@@ -183,6 +184,8 @@ def read_log(
     max_gap : str or float
         Between regular logs, a longer step of time is taken as a step of the clock (raw logs: see `gyrostab.regularise`);
         a number is in seconds.
+    limits : mapping of str to float, optional
+        Limits of `gyrostab.limits` with other values, ``{"columns": 50_000}``.
     on_file : callable, optional
         Called with the number of the file (from 1), the number of files and the path before each file is read.
 
@@ -219,6 +222,7 @@ def read_log(
         kind=kind,
         channel=cast(Any, channel),
         strict=strict,
+        limits=dict(limits or {}),
     )
     found = expand(paths)
     extra = expand(options.channel) if options.channel else []
@@ -234,7 +238,11 @@ def read_log(
     spans = lost_spans(lost, _spans(parts), lambda path: scan_file(path, options)) if lost else {}
     if regular:
         log = join_logs(
-            [_check_regular(part, path.name, options) for path, part in parts.items()], regular, max_gap=max_gap, lost=list(spans.values())
+            [_check_regular(part, path.name, options) for path, part in parts.items()],
+            regular,
+            max_gap=max_gap,
+            lost=list(spans.values()),
+            limits=options.limits,
         )
     else:
         _check_options([*parts.values(), *channels])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gyrostab.errors import OptionError
+from gyrostab.limits import check_limits
 from gyrostab.timegrid import stamp_ns
 
 __all__ = ["ColumnSummary", "FileSummary", "ReadOptions"]
@@ -39,6 +40,8 @@ class ReadOptions:
         The file is read for its channels; gyro axes are not asked for.
     strict : bool
         A damaged place in a regular log is an error instead of a gap.
+    limits : mapping of str to float
+        Limits of `gyrostab.limits` with other values.
 
     Raises
     ------
@@ -60,6 +63,7 @@ class ReadOptions:
     channel: Sequence[str | Path] = ()
     channels_only: bool = False
     strict: bool = False
+    limits: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.rate is not None and not (np.isfinite(self.rate) and self.rate > 0):
@@ -72,6 +76,7 @@ class ReadOptions:
                 stamp_ns(value, f"--{name}")
         for name in ("map", "unit"):
             object.__setattr__(self, name, dict(getattr(self, name) or {}))
+        object.__setattr__(self, "limits", check_limits(self.limits))
         object.__setattr__(self, "channel", self.channel or ())
         if isinstance(self.channel, str | Path):
             object.__setattr__(self, "channel", (self.channel,))

@@ -6,7 +6,7 @@ No value is ever interpolated, averaged or moved by a fraction of a sample: a sa
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -17,10 +17,11 @@ import xarray as xr
 from gyrostab.clock import time_of_day
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.gaps import gap_variables, name_lost
+from gyrostab.limits import check_limits
 from gyrostab.regularise.fill import gathered, on_grid
 from gyrostab.regularise.gaps import find_gaps, gap_table
 from gyrostab.regularise.notes import describe, describe_channels, describe_rate
-from gyrostab.regularise.place import Placement, place_by_count, place_by_stamp, place_without_time
+from gyrostab.regularise.place import Placement, check_grid, place_by_count, place_by_stamp, place_without_time
 from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_near, estimate_rate, odd_stretches
 from gyrostab.regularise.repeats import find_repeats, with_repeats
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
@@ -144,6 +145,7 @@ def regularise(
     max_gap: str | float = "10D",
     chunk: int | None = None,
     block: int = BLOCK,
+    limits: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
     """Put the rows of a raw log on a uniform time axis, with NaN at every missing sample and a table of gaps.
 
@@ -162,6 +164,8 @@ def regularise(
         Samples of a chunk of the lazy arrays; about 20 minutes by default, as in a stored log.
     block : int
         Rows in memory at one time; the result does not depend on it.
+    limits : mapping of str to float, optional
+        Limits of `gyrostab.limits` with other values; ``grid_samples`` bounds the samples of an axis.
 
     Returns
     -------
@@ -172,7 +176,8 @@ def regularise(
     Raises
     ------
     TimeError
-        When no sampling rate can be found, or the one given is more than 2 % from what the stamps say.
+        When no sampling rate can be found, or the one given is more than 2 % from what the stamps say; or when the grid has far more
+        samples than there are rows.
     FormatError
         When no row holds a number.
     OptionError, SchemaError
@@ -200,9 +205,11 @@ def regularise(
     _checked(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
+    allowed = check_limits(limits)
     found = survey(raw, name, block=block)
     notes: list[str] = []
     placement, hertz = _place(raw, found, _declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block, notes=notes)
+    check_grid(raw, placement, hertz, gap_limit, allowed)
     chunk = chunk or chunk_samples(hertz)
     table = name_lost(find_gaps(placement, found), raw.attrs.get("unreadable_spans", ()), placement.start, hertz)
     notes += describe(raw, found, placement, table, hertz)

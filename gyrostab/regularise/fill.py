@@ -14,9 +14,10 @@ from gyrostab.kernels.stamps import NO_STAMP, RESTART, STEP
 from gyrostab.regularise.place import Placement
 from gyrostab.regularise.survey import BLOCK
 from gyrostab.store.direct import can_fill, fill_row, held, stretch, with_fill
+from gyrostab.threads import in_order
 from gyrostab.timegrid import grid_times
 
-__all__ = ["SMALL", "gathered", "on_grid", "samples_of"]
+__all__ = ["SMALL", "count_present", "gathered", "on_grid", "samples_of"]
 
 #: Numbers up to which an array is held in memory instead of being computed when needed.
 SMALL = 2_000_000
@@ -86,6 +87,7 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, 
     lazy = rows if isinstance(rows, da.Array) else held(np.asarray(rows), BLOCK)
     ends = placement.runs[:, 0] + placement.runs[:, 2]
     parts, empty = [], 0
+    filled: list[tuple[int, int]] = []  # chunks that hold samples at all
 
     def flush() -> None:
         nonlocal empty
@@ -100,6 +102,7 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, 
             empty += end - begin
             continue
         flush()
+        filled.append((begin, end))
         first, last = int(runs[:, 1].min()), int((runs[:, 1] + runs[:, 2]).max())
         runs[:, 1] -= first
         source = lazy[..., first:last].rechunk(-1)
@@ -107,9 +110,26 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, 
         parts.append(source.map_blocks(_fill, runs=runs, size=end - begin, scale=scale, unit=unit, dtype=np.float64, chunks=shape))
     flush()
     placed = da.concatenate(parts, axis=-1)
+    placed.gyrostab_filled = filled
     if not can_fill(lazy) or lazy.dtype != np.float64:
         return placed
     return with_fill(placed, partial(_fill_samples, lazy, placement.runs, ends, scale, unit))
+
+
+def count_present(array: Any) -> int:
+    """Count the samples of an array on the grid that are not NaN; chunks that are nothing but gap are not looked at.
+
+    Examples
+    --------
+    >>> count_present(np.array([[1.0, np.nan, 2.0]]))
+    2
+    """
+    filled = getattr(array, "gyrostab_filled", [(begin, begin + BLOCK) for begin in range(0, array.shape[-1], BLOCK)])
+
+    def count(ends: tuple[int, int]) -> int:
+        return int(np.count_nonzero(~np.isnan(stretch(array, *ends))))
+
+    return sum(in_order(count, ((begin, min(end, array.shape[-1])) for begin, end in filled)))
 
 
 def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int64]:

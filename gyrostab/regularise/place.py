@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
+from gyrostab.gaps import duration, stamp_text
 from gyrostab.kernels import stamps as kernel
 from gyrostab.kernels.stamps import LOOK, NO_STAMP, RESTART, STEP
+from gyrostab.limits import describe_limit, is_absurd_grid
 from gyrostab.regularise.rate import RateEstimate, Stamps
+from gyrostab.regularise.survey import file_of
+from gyrostab.store.direct import stretch
 from gyrostab.timegrid import period_ns
 
-__all__ = ["Placement", "place_by_count", "place_by_stamp", "place_without_time"]
+__all__ = ["Placement", "check_grid", "place_by_count", "place_by_stamp", "place_without_time"]
 
 #: Rows that the placement kernel takes at a time.
 _STRETCH = 1 << 18
@@ -57,6 +62,47 @@ def _placement(start: int, runs: list[NDArray[np.int64]], events: list[NDArray[n
     happened = np.concatenate([*events, np.empty((0, 5), dtype=np.int64)])
     table = table[np.argsort(table[:, 0], kind="stable")]
     return Placement(start, table, happened[np.argsort(happened[:, 1], kind="stable")], wander)
+
+
+def check_grid(raw: xr.Dataset, placement: Placement, rate: float, max_gap: float, limits: Mapping[str, float]) -> None:
+    """Refuse a grid that is out of proportion to the rows, before anything is done for each of its samples.
+
+    Parameters
+    ----------
+    raw : xarray.Dataset
+        Raw log.
+    placement : Placement
+        Its rows on the grid.
+    rate, max_gap : float
+        Sampling rate [Hz] and longest gap [s].
+    limits : mapping of str to float
+        Limits that the user set.
+
+    Raises
+    ------
+    TimeError
+        With the two stamps that make the grid so long, and the options that help.
+    """
+    if not is_absurd_grid(placement.size, placement.placed, limits):
+        return
+    runs = placement.runs
+    holes = runs[1:, 0] - runs[:-1, 0] - runs[:-1, 2]
+    widest = int(np.argmax(holes))
+    rows = [int(runs[widest, 1] + runs[widest, 2] - 1), int(runs[widest + 1, 1])]
+    stamps = [int(stretch(raw["time"].data, row, row + 1).astype("datetime64[ns]").view(np.int64)[0]) for row in rows]
+    places = [f"{stamp_text(stamp)} (row {file_of(raw, row)[1]})" for stamp, row in zip(stamps, rows, strict=True)]
+    gap = holes[widest] / rate
+    if gap >= 1.0:
+        fix = (
+            f"correct the stamp or the unit of the time column, or give --max-gap {min(max_gap, gap) / 2:.2g}s to take it for a clock step"
+        )
+    else:
+        fix = f"other stamps are {duration(1.0 / rate)} apart, too close for a log of that length: correct them or the unit of time"
+    raise TimeError(
+        f"{file_of(raw, rows[0])[0]}: from {places[0]} to {places[1]} there are {duration(gap)} without samples, and the grid of "
+        f"{rate:.10g} Hz would have {placement.size:.4g} samples for {placement.placed:,} rows; {fix}. If the stamps are right: "
+        f"{describe_limit('grid_samples', placement.size, limits)}"
+    )
 
 
 def place_without_time(rows: int, start: int) -> Placement:

@@ -49,7 +49,7 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
         Longest gap; a longer step of the stamps is taken for a step of the clock.
     **reading
         Options of `gyrostab.read.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``,
-        ``strict``, ``on_file``.
+        ``strict``, ``limits``, ``on_file``.
 
     Returns
     -------
@@ -62,7 +62,7 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
 
     log = read_log(paths, max_gap=max_gap, **reading)
     if "sampling_rate_hz" not in log.attrs:
-        log = regularise(log, rate=reading.get("rate"), max_gap=max_gap)
+        log = regularise(log, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits"))
         said = "; ".join(f"{name}: {_said(value)}" for name, value in reading.items() if value and name != "on_file")
         if said:
             log.attrs["history"] += f" (read with {said})"

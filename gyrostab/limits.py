@@ -1,0 +1,201 @@
+"""The limits of what a reader does for the bytes that are there, each with its reason and the option that lifts it.
+
+Every reader knows rows, columns and bytes of a file before it reads values, and the regularisation knows rows and samples
+before it lays out the grid. They compare these numbers with the limits here, so a damaged or absurd file ends in one message.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gyrostab.errors import FormatError, OptionError
+
+__all__ = [
+    "LIMITS",
+    "Limit",
+    "bytes_present",
+    "check_chunk",
+    "check_limits",
+    "check_stored",
+    "describe_limit",
+    "is_absurd_grid",
+    "limit_value",
+]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A limit that a user may raise with ``--limit NAME=NUMBER`` (``limits={"NAME": NUMBER}`` in Python)."""
+
+    value: float
+    unit: str
+    reason: str
+
+
+LIMITS: Mapping[str, Limit] = {
+    "columns": Limit(
+        20_000,
+        "columns",
+        "A logger writes tens of columns. The header of this many is understood in about a second; beyond it the separator is "
+        "probably wrong, or the table is transposed.",
+    ),
+    "grid_samples": Limit(
+        1e9,
+        "samples of one axis",
+        "The default --max-gap of 10 days at 1 kHz makes 8.6e8 samples. An axis of 1e9 samples takes about ten seconds to analyse "
+        "(10 ns a sample) even if the file has a hundred rows. Above it a grid may have 100 samples for each row, which allows a "
+        "recorder that runs for 1 % of the time.",
+    ),
+    "stored_samples": Limit(
+        1e9,
+        "samples of all columns",
+        "As for grid_samples. Above it a file may have 1000 samples for each of its bytes: deflate never packs more than 1032 "
+        "bytes into one, so a file below that ratio holds almost no written values.",
+    ),
+    "chunk_bytes": Limit(
+        2**29,
+        "bytes",
+        "A chunk is decoded as a whole in memory, by two threads side by side: 512 MiB keep a run near 1.5 GiB. "
+        "It holds 46 hours of one axis at 400 Hz in doubles; usual chunks hold 1 to 100 MB.",
+    ),
+}
+
+#: Samples of the grid for each row, and samples claimed for each byte present, that are in proportion; see `LIMITS`.
+GRID_SAMPLES_PER_ROW = 100
+STORED_SAMPLES_PER_BYTE = 1000
+
+
+def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
+    """Return the limits that a user gave, as numbers.
+
+    Raises
+    ------
+    OptionError
+        For a name that is not a limit, or a value that is not a number above 0.
+
+    Examples
+    --------
+    >>> check_limits({"columns": "5e4"})
+    {'columns': 50000.0}
+    """
+    found = {}
+    for name, text in (given or {}).items():
+        if name not in LIMITS:
+            raise OptionError(f"--limit {name}: there is no such limit; the limits are {', '.join(LIMITS)}")
+        try:
+            found[name] = float(text)
+        except (TypeError, ValueError) as error:
+            raise OptionError(f"--limit {name}={text}: give a number of {LIMITS[name].unit}") from error
+        if not found[name] > 0:
+            raise OptionError(f"--limit {name}={text}: give a number above 0")
+    return found
+
+
+def limit_value(name: str, given: Mapping[str, float] | None = None) -> float:
+    """Return the value of a limit, as the user set it or by default.
+
+    Examples
+    --------
+    >>> limit_value("columns"), limit_value("columns", {"columns": 5e4})
+    (20000, 50000.0)
+    """
+    return (given or {}).get(name, LIMITS[name].value)
+
+
+def describe_limit(name: str, needed: float, given: Mapping[str, float] | None = None) -> str:
+    """Return the end of a message: the limit, and the option that lifts it.
+
+    Examples
+    --------
+    >>> describe_limit("columns", 99_999)
+    'the limit is 20000 columns, and --limit columns=1e+05 lifts it'
+    """
+    allowed = limit_value(name, given)
+    return f"the limit is {allowed:.4g} {LIMITS[name].unit}, and --limit {name}={_round_up(needed)} lifts it"
+
+
+def _round_up(needed: float) -> str:
+    """Return a number of two digits that is not below `needed`.
+
+    Examples
+    --------
+    >>> _round_up(1_010_000), _round_up(7)
+    ('1.1e+06', '7')
+    """
+    digits = 10.0 ** (max(np.floor(np.log10(max(needed, 1.0))), 1.0) - 1.0)
+    return f"{np.ceil(needed / digits) * digits:.2g}"
+
+
+def is_absurd_grid(samples: int, rows: int, given: Mapping[str, float] | None = None) -> bool:
+    """Return whether a grid has far more samples than there are rows; see ``grid_samples`` in `LIMITS`.
+
+    Examples
+    --------
+    >>> is_absurd_grid(8 * 86400 * 400, 1000), is_absurd_grid(9 * 86400 * 10_000, 1000)
+    (False, True)
+    """
+    return samples > max(limit_value("grid_samples", given), GRID_SAMPLES_PER_ROW * rows)
+
+
+def bytes_present(path: Path) -> int:
+    """Return the size of a file, or of all files in a directory."""
+    if not path.is_dir():
+        return path.stat().st_size
+    total, folders = 0, [os.fspath(path)]
+    while folders:
+        with os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir():
+                    folders.append(entry.path)
+                else:
+                    total += entry.stat().st_size
+    return total
+
+
+def check_stored(path: Path, rows: int, columns: int, given: Mapping[str, float] | None = None) -> None:
+    """Refuse a file that claims far more samples than its bytes can hold.
+
+    Parameters
+    ----------
+    path : Path
+        File or directory.
+    rows, columns : int
+        What the file claims to hold, of the columns that are read.
+    given : mapping of str to float, optional
+        Limits that the user set.
+
+    Raises
+    ------
+    FormatError
+        With the numbers, and the option that lifts the limit.
+    """
+    claimed = rows * columns
+    if claimed <= limit_value("stored_samples", given):
+        return
+    present = bytes_present(path)
+    if claimed > STORED_SAMPLES_PER_BYTE * present:
+        raise FormatError(
+            f"{path.name}: it claims {rows:.4g} samples in each of {columns} columns, but holds {present:,} bytes: nearly all of them "
+            f"were never written. Copy it again, or cut it to what was recorded; {describe_limit('stored_samples', claimed, given)}"
+        )
+
+
+def check_chunk(path: Path, name: str, chunk_bytes: int, given: Mapping[str, float] | None = None) -> None:
+    """Refuse a variable whose chunks are too large to be decoded in memory.
+
+    Raises
+    ------
+    FormatError
+        With the size of a chunk, and the option that lifts the limit.
+    """
+    if chunk_bytes > limit_value("chunk_bytes", given):
+        raise FormatError(
+            f"{path.name}: a chunk of {name!r} has {chunk_bytes:.4g} bytes. If the file is damaged, copy it again, else store it in "
+            f"smaller chunks; {describe_limit('chunk_bytes', chunk_bytes, given)}"
+        )
