@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, UnitError
 from gyrostab.read import read_log
 from gyrostab.read.packing import Packing
 
@@ -141,3 +141,44 @@ def test_counts_beyond_the_digits_of_a_float_are_compared_exactly():
     large = np.array([2**62, 2**62 + 1], dtype="i8")
     packing = Packing.from_attributes("x", large.dtype, {"_FillValue": large[0]})
     assert np.ma.getmaskarray(packing.read_counts(large)).tolist() == [True, False]
+
+
+def write_regular(path: Path, stored: np.ndarray, attributes: dict[str, Any], **time: Any) -> Path:
+    """A regular log of some other program: axis, a stamp for each sample, the sampling rate as an attribute."""
+    stamps = (["time"], np.arange(ROWS) * 10, {"units": "milliseconds since 2026-01-01", **time})
+    log = xr.Dataset(
+        {"rate": (["axis", "time"], stored[None], {"units": "degree hour-1", **attributes})},
+        coords={"axis": ["x"]},
+        attrs={"sampling_rate_hz": 100.0},
+    ).assign(time_=stamps)
+    log = xr.decode_cf(log, decode_times=False, mask_and_scale=False).rename(time_="time")
+    if path.suffix == ".zarr":
+        log.to_zarr(path, consolidated=False)
+    else:
+        log.to_netcdf(path, encoding={"rate": {"_FillValue": None}})  # xarray would add NaN
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:The data type")
+@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+@pytest.mark.parametrize("case", ["plain", "scale and offset", "several missing", "valid range, packed", "valid max", "unsigned, packed"])
+def test_a_regular_log_of_another_program_is_decoded_alike(tmp_path, case, suffix):
+    stored, attributes, wanted = CASES[case]
+    log = read_log(write_regular(tmp_path / f"log{suffix}", stored, attributes))
+    np.testing.assert_allclose(log.rate.values[0], wanted, rtol=1e-12)
+    np.testing.assert_allclose(log.rate[:, 7:11].values[0], wanted[7:11], rtol=1e-12)
+    assert log.time.values[5] == np.datetime64("2026-01-01T00:00:00.05")
+
+
+@pytest.mark.parametrize(("attribute", "value"), [("calendar", "noleap"), ("units", "seconds since now")])
+def test_a_regular_log_with_dates_of_no_recording_is_refused(tmp_path, attribute, value):
+    with pytest.raises(UnitError, match=f"log.nc: variable 'time': .*{value}"):
+        read_log(write_regular(tmp_path / "log.nc", COUNTS, {}, **{attribute: value}))
+
+
+def test_an_unwritten_sample_of_a_regular_log_is_missing(tmp_path):
+    path = write_regular(tmp_path / "log.nc", COUNTS.astype("f4"), {})
+    with netCDF4.Dataset(path, "a") as file:
+        file.variables["rate"].set_auto_mask(False)
+        file.variables["rate"][0, 3] = netCDF4.default_fillvals["f4"]
+    assert np.flatnonzero(np.isnan(read_log(path).rate.values[0])).tolist() == [3]

@@ -13,7 +13,7 @@ from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Column, Plan
 from gyrostab.read.intake import Intake, summary_of
 from gyrostab.read.options import FileSummary, ReadOptions
-from gyrostab.read.stamps import NAT, cells_to_ns, dates_to_ns, floats_to_ns, integers_to_ns, looks_iso
+from gyrostab.read.stamps import NAT, cells_to_ns, dates_to_ns, floats_to_ns, integers_to_ns, looks_iso, signed_counts
 
 __all__ = ["Fetch", "holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
 
@@ -56,8 +56,7 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
     elif array.dtype.kind == "f":
         stamps = floats_to_ns(array, unit, options.epoch_ns)
     else:
-        wide = np.minimum(array, np.uint64(2**63 - 1)) if array.dtype == np.uint64 else array
-        stamps = integers_to_ns(wide.astype(np.int64), unit, options.epoch_ns)
+        stamps = integers_to_ns(signed_counts(array), unit, options.epoch_ns)
     return stamps if mask is None else np.where(mask, NAT, stamps)
 
 

@@ -22,7 +22,8 @@ from gyrostab.read.arrays import float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
-from gyrostab.read.packing import Decoder, fold_packing, text_attributes
+from gyrostab.read.packing import Decoder, decode_variables, fold_packing, text_attributes
+from gyrostab.read.stamps import names_epoch
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
 from gyrostab.store import name_file, open_stored, stored_attribute
 from gyrostab.timegrid import grid_times, time_coordinate
@@ -32,6 +33,8 @@ __all__ = ["matches", "read", "scan"]
 
 MAX_COLUMNS = 64
 CHECKED_BLOCKS = 33
+#: How xarray opens a file here: numbers and stamps are decoded as they are read.
+_UNDECODED: dict[str, Any] = {"chunks": None, "mask_and_scale": False, "decode_times": False, "create_default_indexes": False}
 _NO_LOGS = {"surface": "a dynamic Allan variance", "product": "a product"}
 
 
@@ -93,16 +96,19 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     extra: Any = {"consolidated": False} if path.is_dir() else {}
     try:
-        stored = xr.open_dataset(path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False, **extra)
+        stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
     has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
-    if not (has_signal and "sampling_rate_hz" in stored.attrs and {"axis", "time"} <= set(stored.variables)):
+    has_stamps = "time" in stored.variables and names_epoch(str(stored.variables["time"].attrs.get("units", "")))
+    if not (has_signal and has_stamps and "sampling_rate_hz" in stored.attrs and "axis" in stored.variables):
         stored.close()
         if path.is_dir():
             raise FormatError(f"{path.name}: this Zarr store is no gyrostab log (axis and time, attribute sampling_rate_hz)")
         return None
-    log = xr.decode_cf(_chunked(name_file(stored, path)))  # an index would hold every stamp in memory
+    for variable in stored.variables.values() if engine == "netcdf4" else ():
+        variable.attrs = _with_default_fill(variable.attrs, variable.dtype)
+    log = _chunked(decode_variables(path.name, name_file(stored, path)))  # an index would hold every stamp in memory
     if path.is_dir():
         log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
     log.set_close(stored.close)
@@ -221,14 +227,18 @@ def _look(path: Path, file: Any, options: ReadOptions) -> tuple[list[_Column], i
 
 
 def _attributes(variable: Any) -> dict[str, Any]:
-    """Return the attributes of a variable, and the fill value that the library gives to one without its own."""
+    """Return the attributes of a variable, from which its stored numbers are decoded here."""
+    variable.set_auto_maskandscale(False)
+    return _with_default_fill({name: variable.getncattr(name) for name in variable.ncattrs()}, variable.dtype)
+
+
+def _with_default_fill(attributes: dict[str, Any], dtype: Any) -> dict[str, Any]:
+    """Add the fill value that the library gives to a variable without its own; bytes have none (users guide)."""
     import netCDF4
 
-    variable.set_auto_maskandscale(False)
-    attributes = {name: variable.getncattr(name) for name in variable.ncattrs()}
-    if not {"_FillValue", "_Unsigned"} & set(attributes) and variable.dtype.itemsize > 1:  # bytes have no default (users guide)
-        attributes["_FillValue"] = variable.dtype.type(netCDF4.default_fillvals[variable.dtype.str[1:]])
-    return attributes
+    if {"_FillValue", "_Unsigned"} & set(attributes) or dtype.kind not in "iuf" or dtype.itemsize == 1:
+        return attributes
+    return {**attributes, "_FillValue": dtype.type(netCDF4.default_fillvals[dtype.str[1:]])}
 
 
 def _columns(file: Any, variable: Any, dim: str) -> list[_Column]:

@@ -11,16 +11,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
+from xarray.backends import BackendArray
+from xarray.core.indexing import ExplicitIndexer, IndexingSupport, LazilyIndexedArray, explicit_indexing_adapter
 
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, UnitError
 from gyrostab.read.columns import Column, Plan
-from gyrostab.read.stamps import TimeUnit
+from gyrostab.read.stamps import NAT, TimeUnit, floats_to_ns, integers_to_ns, names_epoch, parse_time_unit, signed_counts
 
-__all__ = ["ATTRIBUTES", "Decoder", "Packing", "attribute_text", "fold_packing", "text_attributes"]
+__all__ = ["ATTRIBUTES", "Decoder", "Packing", "attribute_text", "decode_variables", "fold_packing", "text_attributes"]
 
 #: Stored numbers -> counts or values.
 Decoder = Callable[[Any], Any]
@@ -90,6 +94,11 @@ class Packing:
         missing = [value for key in ("_FillValue", "missing_value") for value in numbers.get(key, ())]
         low, high = _valid_range(where, numbers, stored, scale, offset)
         return cls(stored, tuple(_representable(missing, stored)), low, high, scale, offset)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether every stored number is a value as it stands."""
+        return self.is_plain and not self.missing and self.low == -np.inf and self.high == np.inf
 
     @property
     def is_plain(self) -> bool:
@@ -227,3 +236,76 @@ def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
     if packing.dtype.kind == "f" or step.denominator != 1 or step <= 0 or shift.denominator != 1 or (shift and unit.epoch is None):
         return None
     return replace(unit, ns=step, epoch=None if unit.epoch is None else unit.epoch + int(shift))
+
+
+def decode_variables(name: str, stored: xr.Dataset) -> xr.Dataset:
+    """Unpack the numbers and stamps of a dataset that was opened without decoding them, as they are read.
+
+    Parameters
+    ----------
+    name : str
+        The file, for messages.
+    stored : xarray.Dataset
+        Variables as they are stored, with all attributes.
+
+    Returns
+    -------
+    xarray.Dataset
+        Packed numbers as float64 with NaN for what is missing or invalid, stamps as datetime64[ns]; the packing of whole
+        numbers is in the encoding.
+
+    Raises
+    ------
+    FormatError, UnitError
+        When an attribute has no usable value, or an epoch can be read in several ways.
+    """
+    variables = {key: _decode_variable(name, key, variable) for key, variable in stored.variables.items()}
+    coords = {key: variables.pop(key) for key in stored.coords}
+    decoded = xr.Dataset(variables, xr.Coordinates(coords, indexes={}), stored.attrs)
+    decoded.set_close(stored._close)
+    return decoded
+
+
+def _decode_variable(name: str, key: Any, variable: xr.Variable) -> xr.Variable:
+    if variable.dtype.kind not in "iuf":
+        return variable
+    packing = Packing.from_attributes(f"{name}: variable {key!r}", variable.dtype, variable.attrs)
+    attrs = {attribute: value for attribute, value in variable.attrs.items() if attribute not in _PACKING}
+    chunks = {key: value for key, value in variable.encoding.items() if key == "preferred_chunks"}
+    if names_epoch(str(attrs.get("units", ""))):
+        try:
+            unit = parse_time_unit(str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None)))
+        except UnitError as error:
+            raise UnitError(f"{name}: variable {key!r}: {error}") from error
+        stamps = _DecodedArray(variable, partial(_read_stamps, packing, unit), "datetime64[ns]")
+        return xr.Variable(variable.dims, LazilyIndexedArray(stamps), attrs, chunks)
+    if packing.is_identity and packing.dtype == variable.dtype:
+        return variable
+    encoding = dict(chunks)
+    if packing.dtype.kind in "iu" and packing.scale != 1.0:
+        encoding |= {"dtype": variable.dtype, "scale_factor": packing.scale}
+        encoding |= {"add_offset": packing.offset} if packing.offset else {}
+    values = _DecodedArray(variable, packing.read_values, np.float64)
+    return xr.Variable(variable.dims, LazilyIndexedArray(values), attrs, encoding)
+
+
+class _DecodedArray(BackendArray):
+    """An array whose parts are decoded as they are read, so that a part of it never loads the rest."""
+
+    def __init__(self, variable: xr.Variable, decode: Decoder, dtype: Any):
+        self.variable, self.decode = variable, decode
+        self.shape, self.dtype = variable.shape, np.dtype(dtype)
+
+    def __getitem__(self, key: ExplicitIndexer) -> Any:
+        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER, self._read)
+
+    def _read(self, key: tuple[Any, ...]) -> Any:
+        return self.decode(self.variable[key].values)
+
+
+def _read_stamps(packing: Packing, unit: TimeUnit, stored: Any) -> NDArray[np.datetime64]:
+    folded = unit if packing.is_plain else _fold_time(unit, packing)
+    counts = packing.read_values(stored) if folded is None else packing.read_counts(stored)
+    array = np.ma.getdata(counts)
+    stamps = floats_to_ns(array, unit, 0) if array.dtype.kind == "f" else integers_to_ns(signed_counts(array), folded or unit, 0)
+    return np.where(np.ma.getmaskarray(counts), NAT, stamps).view("datetime64[ns]")

@@ -30,6 +30,7 @@ __all__ = [
     "looks_iso",
     "names_epoch",
     "parse_time_unit",
+    "signed_counts",
     "texts_to_ns",
 ]
 
@@ -190,6 +191,12 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
         scaled = (scaled + down // 2) // down
     inside &= (scaled <= _LIMIT - max(rest, 0)) & (scaled >= -_LIMIT - min(rest, 0))
     return np.where(inside, np.where(inside, scaled, 0) + rest, NAT)
+
+
+def signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
+    """Return whole numbers as int64; unsigned ones that exceed it become the largest, which is no stamp."""
+    wide = np.minimum(counts, np.uint64(_LIMIT)) if counts.dtype.kind == "u" and counts.dtype.itemsize == 8 else counts
+    return wide.astype(np.int64)
 
 
 def floats_to_ns(values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
