@@ -66,7 +66,8 @@ def diagnose(
         What it is compared with: noise and effects of a model, or a simulated log on the same stamps. Without it the five noise terms,
         calibrated on quiet stretches of the recording.
     quiet : (start, end) or list of these, optional
-        Quiet stretches, as seconds since the start or ISO times; found by themselves by default.
+        Quiet stretches, as seconds since the start or ISO times; detected automatically by default. With a `simulation` they calibrate
+        the level of its noise: one factor for each axis.
     seed : int
         Of the null records.
     nulls : int
@@ -220,12 +221,11 @@ def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:
 def _baseline(task: Task, reduced: xr.Dataset) -> xr.Dataset:
     if task.given is None:
         return calibrate(reduced, quiet=task.quiet)
-    if task.quiet is not None:
-        raise OptionError("quiet says what to calibrate on; with a simulation nothing is calibrated, so leave one of the two out")
     if isinstance(task.given, xr.Dataset):
         same = f"{reduced.attrs['block_samples']}samples"
-        return from_simulation(reduced, reduce_log(task.given, block=same, restart_gap=task.restart_gap, progress=task.progress))
-    return from_model(reduced, task.given)
+        simulated = reduce_log(task.given, block=same, restart_gap=task.restart_gap, progress=task.progress)
+        return from_simulation(reduced, simulated, quiet=task.quiet)
+    return from_model(reduced, task.given, quiet=task.quiet)
 
 
 def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -> Callable[[], Iterable[xr.Dataset]]:

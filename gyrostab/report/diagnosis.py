@@ -118,11 +118,18 @@ def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Axes, sampling rate", f"{', '.join(recording['axes'])} at {recording['sampling_rate_hz']:g} Hz"),
         ("Channels", ", ".join(recording["channels"]) or "none"),
         ("Missing samples", f"{100.0 * recording['missing_share']:.2g} %"),
-        ("Simulation compared with", _SOURCE[baseline["source"]]),
+        ("Simulation compared with", _source_text(baseline)),
         *([("Expected, with the size it has here", expected)] if expected else []),
         *([("Quiet stretches (UTC)", spans + (f" and {more} more" if more > 0 else ""))] if spans else []),
         ("Time taken", f"{content['seconds']:.3g} s"),
     ]
+
+
+def _source_text(baseline: Mapping[str, Any]) -> str:
+    """Say where the noise of the simulation comes from."""
+    text = _SOURCE[baseline["source"]]
+    is_scaled = baseline["source"] == "model" and baseline["calibrated_on"]
+    return f"{text}, its noise scaled to quiet stretches of this recording" if is_scaled else text
 
 
 def _effect(effect: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:

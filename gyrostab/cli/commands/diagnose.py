@@ -46,7 +46,8 @@ def diagnose(
         stretches of the recording).
     quiet
         Stretch of the recording in which nothing happens, for the calibration: 2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after
-        the start. Repeat for more (default: found by itself).
+        the start. Repeat for more (default: detected automatically). With --simulation it calibrates the level of the simulated
+        noise, by one factor for each axis.
     block
         Length of the blocks that are looked at (default: 20s, less in short records).
     level

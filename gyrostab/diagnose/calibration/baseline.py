@@ -14,6 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.calibration.known import evenness, known_effects
+from gyrostab.diagnose.calibration.level import quiet_level, scaled_noise
 from gyrostab.diagnose.calibration.noise_statistics import NOISE, common_variance, line_columns, noise_powers, white_variance
 from gyrostab.diagnose.calibration.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
 from gyrostab.diagnose.calibration.quiet import loudness, quiet_blocks, quiet_spans
@@ -91,7 +92,7 @@ def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     Raises
     ------
     OptionError
-        When `quiet` holds too few blocks.
+        When `quiet` holds fewer than 100 samples in whole blocks.
     SchemaError
         When an axis has no spectra to calibrate on.
 
@@ -234,8 +235,8 @@ def _ramp_error(reduced: xr.Dataset, white: Array, value: Array, quiet: NDArray[
     return error
 
 
-def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
-    """Baseline of a model that is taken as it is: its noise, and its effects as far as means and band powers show them.
+def from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Dataset:
+    """Take the noise of a model, and its effects as far as means and band powers show them.
 
     Parameters
     ----------
@@ -243,12 +244,15 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
         The recording, from `reduce_log`.
     model : path, mapping or Model
         As `gyrostab.simulate` takes it.
+    quiet : array_like of bool (block,), or (start, end) or several of these, optional
+        Quiet stretches of the recording. One factor for each axis then fits the noise of the model to them; its noise terms keep
+        their proportions, and its effects their sizes. Without it the noise is taken as it is.
 
     Returns
     -------
     xarray.Dataset
-        As `calibrate` has it; the noise has no error. With ``cross(pair, block, band)``, the expected cross-spectrum, where axes share
-        an effect of the model. ``attrs["left_out"]`` names the effects that show elsewhere too (in
+        As `calibrate` has it; the noise has the error of that factor, or none. With ``cross(pair, block, band)``, the expected
+        cross-spectrum, where axes share an effect of the model. ``attrs["left_out"]`` names the effects that show elsewhere too (in
         distributions, transfers, orders of the rotation, random wander): that part of them is not in it.
 
     Raises
@@ -269,12 +273,17 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
         draws = np.tile(square, (DRAWS, 1))
         K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
         found.append(Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True))
+    chosen = np.ones((len(axes), reduced.sizes["block"]), np.bool_)
+    attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": made.source}
+    if quiet is not None:
+        chosen, attrs["quiet_by"] = quiet_blocks(reduced, quiet)
+        attrs["calibrated_on"] = quiet_spans(reduced, chosen)
+        found = _levelled(reduced, made, found, chosen)
     known = known_effects(reduced, made, np.stack([one.square for one in found]))
+    attrs["left_out"] = known.left_out
     hours = (reduced["begin"].values + reduced["end"].values) / (2.0 * HOUR)
     ramp = np.array([made.coefficients(axis)["R"] for axis in axes])
-    attrs = {"source": "model", "calibrated_on": [], "model": made.source, "left_out": known.left_out}
-    quiet = np.ones((len(axes), reduced.sizes["block"]), np.bool_)
-    out = assemble(reduced, found, quiet=quiet, attrs=attrs, known_mean=known.mean + ramp[:, None] * hours, spectrum=known.spectrum)
+    out = assemble(reduced, found, quiet=chosen, attrs=attrs, known_mean=known.mean + ramp[:, None] * hours, spectrum=known.spectrum)
     out = with_wandering(out, known.wandering, known.spectrum)
     if known.cross is not None:
         out["cross"] = (("pair", "block", "band"), known.cross, {"long_name": "expected cross-spectrum", "units": _POWER})
@@ -285,12 +294,24 @@ def from_model(reduced: xr.Dataset, model: Any) -> xr.Dataset:
         noise = np.stack([line_columns(reduced) @ one.square for one in found])
         out["shape_alone"] *= evenness(noise + known.lines["peaks"], reduced)[:, None]
     out["coefficient"].loc[{"term": "R"}] = ramp
-    out["stderr"][:] = 0.0
+    out["stderr"].loc[{"term": list(TERMS) if quiet is None else ["R"]}] = 0.0
     return out
 
 
-def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset) -> xr.Dataset:
-    """Baseline of a simulated log: its noise with the error of calibrating it, and its level over time where that changes.
+def _levelled(reduced: xr.Dataset, model: Model, found: list[Posterior], quiet: NDArray[np.bool_]) -> list[Posterior]:
+    """Scale the noise of a model to the quiet blocks (axis, block) of the recording, beside its effects."""
+    square = np.stack([one.square for one in found])
+    whole, added = (known_effects(reduced, model, part).spectrum for part in (square, 0.0 * square))
+    return _scaled(found, *quiet_level(reduced, whole - added, added, quiet))
+
+
+def _scaled(found: list[Posterior], factor: Array, error: Array) -> list[Posterior]:
+    every = zip(found, factor.tolist(), error.tolist(), strict=True)
+    return [scaled_noise(one, by, doubt, np.random.default_rng(row)) for row, (one, by, doubt) in enumerate(every)]
+
+
+def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
+    """Take the noise of a simulated log with the error of calibrating it, and its level over time where that changes.
 
     What it shows all the time beside the five noise terms is taken as measured: the form of its spectrum, what axes share, steady lines.
     What a simulation does to the means over time cannot be told from its random walk, so it is not taken as known; `from_model` takes it.
@@ -299,6 +320,8 @@ def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset) -> xr.Dataset:
     ----------
     reduced, simulated : xarray.Dataset
         Recording and simulation, from `reduce_log`.
+    quiet : array_like of bool (block,), or (start, end) or several of these, optional
+        Quiet stretches of the recording: one factor for each axis fits the noise of the simulation to them.
 
     Raises
     ------
@@ -319,6 +342,11 @@ def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset) -> xr.Dataset:
     noise = np.einsum("abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found]))
     attrs = {"source": "simulation", "calibrated_on": quiet_spans(simulated, chosen), "quiet_by": reason}
     spectrum = noise * level[..., None] * shown.form[:, None]
+    if quiet is not None:
+        chosen, attrs["quiet_by"] = quiet_blocks(reduced, quiet)
+        attrs["calibrated_on"] = quiet_spans(reduced, chosen)
+        factor, error = quiet_level(reduced, spectrum, 0.0 * spectrum, chosen)
+        found, spectrum = _scaled(found, factor, error), spectrum * factor[:, None, None]
     return with_shown(assemble(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum), shown, reduced)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ Array = NDArray[np.float64]
 #: Blocks over which the level is averaged.
 LEVEL_SPANS = (1, 5, 15)
 _LEAST_SHARE, _LEAST = 0.25, 16  # of the blocks; below, the calmest are taken
+_LEAST_SAMPLES = 100  # of quiet time: the shortest block of its own choice; N is known to 7 % from them
 _AFTER_RESTART_S = 900.0
 _LOUD = 4.5  # standard deviations
 
@@ -144,7 +147,7 @@ def quiet_blocks(reduced: xr.Dataset, quiet: Any = None) -> tuple[NDArray[np.boo
     Raises
     ------
     OptionError
-        When the quiet time of the user holds no block.
+        When the quiet time of the user holds fewer than 100 samples in whole blocks.
     """
     n, axes = reduced.sizes["block"], reduced.sizes["axis"]
     if quiet is not None:
@@ -176,12 +179,32 @@ def _given(reduced: xr.Dataset, quiet: Any) -> NDArray[np.bool_]:
         for pair in pairs:
             low, high = (_seconds(reduced, edge) for edge in pair)
             chosen |= (begin >= low - 1e-6) & (end <= high + 1e-6)
-    if chosen.sum() < _LEAST:
-        step = float(reduced["end"][0] - reduced["begin"][0])
-        raise OptionError(
-            f"quiet holds {int(chosen.sum())} blocks of {step:g} s; calibration needs {_LEAST} at least: name {_LEAST * step:g} s or more"
-        )
+    _check_size(reduced, int(chosen.sum()))
     return np.asarray(chosen)
+
+
+def _check_size(reduced: xr.Dataset, count: int) -> None:
+    """Refuse too few quiet blocks to tell a noise level from, and warn where they say little of slow noise."""
+    step, size = float(reduced.attrs["block_s"]), int(reduced.attrs["block_samples"])
+    if count * size < _LEAST_SAMPLES:
+        least = -(-_LEAST_SAMPLES // size)
+        raise OptionError(
+            f"quiet holds {count} whole blocks of {step:g} s, {count * size} samples; calibration needs {_LEAST_SAMPLES} samples, from "
+            f"which N is known to {_white_error(_LEAST_SAMPLES):.0%}: name {(least + 1) * step:g} s or more within the "
+            f"{_span(reduced):g} s of the record, or give a shorter block"
+        )
+    if count < _LEAST:
+        warnings.warn(
+            f"the quiet time holds {count} block{'' if count == 1 else 's'} of {step:g} s: N is known to {_white_error(count * size):.1%} "
+            f"at best, and drift slower than {count * step:g} s not at all, so that slow mismatches may be missed; "
+            f"{_LEAST * step:g} s or more are better",
+            stacklevel=2,
+        )
+
+
+def _white_error(samples: int) -> float:
+    """Relative standard error of N from white noise: the variance of n samples scatters by sqrt(2 / n), N by half of that."""
+    return math.sqrt(0.5 / samples)
 
 
 def _seconds(reduced: xr.Dataset, edge: Any) -> float:
