@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.errors import OptionError
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.timegrid import stamp_ns, time_coordinate
+from gyrostab.timegrid import check_rate, check_span, stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
 
 __all__ = ["make_log"]
@@ -65,8 +65,7 @@ def make_log(
     """
     if kind not in SIGNAL_UNITS:
         raise OptionError(f"kind={kind!r}: give 'rate' or 'angle'")
-    if not (np.isfinite(rate) and rate > 0):
-        raise OptionError(f"rate={rate!r}: give the sampling rate in Hz, a number above 0")
+    check_rate(rate, "rate")
     parsed = parse_unit(unit)
     if parsed.quantity != kind:
         raise OptionError(f"unit {unit!r} is a unit of {parsed.quantity}, but kind is {kind!r}")
@@ -78,6 +77,7 @@ def make_log(
         raise OptionError(f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, time) and one name per axis")
     if parsed.factor != 1.0:
         data = data * parsed.factor
+    check_span(stamp_ns(start), rate, data.shape[1], "make_log")
     coordinates = time_coordinate(stamp_ns(start), rate, data.shape[1])
     attrs = {"units": SIGNAL_UNITS[kind], "long_name": "rotation rate" if kind == "rate" else "angle"}
     log = xr.Dataset(

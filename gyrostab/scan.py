@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import xarray as xr
 
 from gyrostab.errors import GyrostabError
 
@@ -80,7 +81,6 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
     log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits"))
     start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
-    gaps = gap_table(log)
     signal = log[signal_name(log)]
     notes = dict.fromkeys(note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *texts(log, "notes")])
     return {
@@ -88,15 +88,20 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         "format": summary.format,
         "start": start,
         "end": end,
-        "span_s": (end - start).total_seconds(),
+        "span_s": (end.value - start.value) / 1e9,
         "rate_hz": float(log.attrs["sampling_rate_hz"]),
         "axes": " ".join(map(str, log["axis"].values)),
         "channels": " ".join(log_channels(log)),
         "rows": int(raw.sizes["time" if regular else "row"]),
-        "gaps": len(gaps),
+        "gaps": len(gap_table(log)) if "gap_start" in log.variables else _count_runs(signal.isnull().all("axis")),
         "missing_share": 1.0 - count_present(signal.data) / signal.size,
         "odd": "; ".join(notes),
     }
+
+
+def _count_runs(missing: xr.DataArray) -> int:
+    """Count the runs of missing samples, for a log without a table of gaps."""
+    return int((missing & ~missing.shift(time=1, fill_value=False)).sum())
 
 
 def print_scan(table: pd.DataFrame) -> None:

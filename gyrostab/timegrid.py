@@ -21,11 +21,24 @@ from numpy.typing import NDArray
 from xarray.core.indexing import IndexSelResult
 from xarray.indexes import CoordinateTransform, CoordinateTransformIndex
 
-from gyrostab.errors import OptionError
+from gyrostab.errors import OptionError, TimeError
 
-__all__ = ["TimeGridIndex", "first_stamp", "grid_index", "grid_times", "period_ns", "split_instant", "stamp_ns", "time_coordinate"]
+__all__ = [
+    "TimeGridIndex",
+    "check_rate",
+    "check_span",
+    "first_stamp",
+    "grid_index",
+    "grid_times",
+    "period_ns",
+    "split_instant",
+    "stamp_ns",
+    "time_coordinate",
+]
 
 NANOSECONDS = 10**9
+#: Stamps are whole nanoseconds: at a higher rate several samples would share one.
+MAX_RATE_HZ = 1e9
 
 _CLOCK = r"(\d{1,2})(?::(\d{1,2})(?::(\d{1,2})(?:[.,](\d+))?)?)?"
 _ZONE = r"\s*(Z|UTC|GMT|[+-]\d{1,2}(?::?\d{2})?)?"
@@ -107,6 +120,40 @@ def stamp_ns(start: Any, what: str = "start") -> int:
     if abs(stamp) >= 2**63:
         raise OptionError(f"{what} {start!r} is outside the years 1678 to 2262, which 64-bit nanoseconds hold; give another date")
     return stamp
+
+
+def check_rate(rate: float, what: str) -> None:
+    """Make sure that a number can be a sampling rate; `what` is how the message calls it.
+
+    Raises
+    ------
+    OptionError
+        When it is not above 0 and at most `MAX_RATE_HZ`.
+
+    Examples
+    --------
+    >>> check_rate(0.0, "--rate")
+    Traceback (most recent call last):
+    gyrostab.errors.OptionError: --rate 0: give the sampling rate in Hz, a number above 0 and at most 1e+09
+    """
+    if not 0 < rate <= MAX_RATE_HZ:  # false for nan too
+        raise OptionError(f"{what} {rate:g}: give the sampling rate in Hz, a number above 0 and at most {MAX_RATE_HZ:g}")
+
+
+def check_span(start: int, rate: float, size: int, where: str) -> None:
+    """Make sure that the stamps of a uniform axis fit into 64-bit nanoseconds; `where` begins the message.
+
+    Raises
+    ------
+    TimeError
+        When the last one is outside the years 1678 to 2262.
+    """
+    last = start + max(size - 1, 0) * NANOSECONDS / rate
+    if not abs(last) < 2.0**63:
+        raise TimeError(
+            f"{where}: {size} samples at {rate:.6g} Hz from {np.datetime64(start, 'ns')} would end outside the years 1678 to 2262; "
+            "check the sampling rate and the start"
+        )
 
 
 def _text_ns(text: str) -> int:

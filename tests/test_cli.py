@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import pty
 import re
@@ -12,12 +13,14 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
 from gyrostab.__main__ import main as start
 from gyrostab.cli import app
-from gyrostab.export import open_log, open_product, open_surface
+from gyrostab.export import open_log, open_product, open_surface, to_netcdf
+from gyrostab.log import make_log
 from tests.command_line import N_TRUE, WINDOW, call, stopped, write_log
 
 COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "report", "plot", "export", "simulate", "diagnose")
@@ -285,3 +288,20 @@ def test_scan_goes_on_after_a_file_that_cannot_be_read(log, tmp_path, capsys):
     assert "empty" in shown.out
     assert str(log) in shown.out
     assert "1 of 2" in shown.err
+
+
+def test_scan_counts_the_gaps_of_a_log_without_a_table(tmp_path, capsys):
+    """`make_log` makes no table of gaps, and `run` needs none."""
+    values = np.arange(100.0)
+    values[10:20] = values[50] = np.nan
+    to_netcdf(make_log(values, rate=10.0, unit="deg/h"), tmp_path / "log.nc")
+    assert call("scan", tmp_path / "log.nc") == 0
+    row = pd.read_csv(io.StringIO(capsys.readouterr().out), sep="\t").iloc[0]
+    assert (row.gaps, row.missing_share, row.rows) == (2, pytest.approx(0.11), 100)
+
+
+def test_a_cell_of_digits_without_end_is_no_stamp(tmp_path, capsys):
+    """Python refuses to convert such a text to an integer, which is no reason to refuse the log."""
+    path = write_log(tmp_path / "log.csv", change=lambda rows: [*rows[:-1], "9" * 5000 + ",1,1"])
+    assert call("scan", path) == 0
+    assert "1 of 6000 rows are unreadable: line 6001" in capsys.readouterr().out

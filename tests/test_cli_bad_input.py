@@ -20,6 +20,14 @@ from gyrostab.run import load_log
 from tests.command_line import RATE, WINDOW, call, stopped, write_log
 
 
+def _without_stamps(*options: object):
+    def make(folder: Path) -> list[object]:
+        (folder / "bad.csv").write_text("gyro_x [deg/h]\n" + "\n".join(str(n % 7) for n in range(100)))
+        return [folder / "bad.csv", "-o", folder / "out.nc", *options, "--window", "4samples"]
+
+    return make
+
+
 @pytest.fixture(scope="module")
 def log(tmp_path_factory) -> Path:
     return write_log(tmp_path_factory.mktemp("log") / "tool.csv")
@@ -125,6 +133,9 @@ BAD_INPUT = {
     "config that is not there": (_bad_log("--config", "/nonexistent/run.toml"), "run.toml"),
     "option that is not there": (_bad_log("--begin-again"), "--begin-again"),
     "value that is no number": (_bad_log("--rate", "fast"), "--rate"),
+    "rate above a stamp per nanosecond": (_without_stamps("--rate", "1e308"), r"--rate 1e\+308: .* at most 1e\+09"),
+    "rate of which one sample takes ages": (_without_stamps("--rate", "1e-300"), "bad.csv: 100 samples at 1e-300 Hz .* years 1678 to 2262"),
+    "start near the end of time": (_without_stamps("--rate", "1", "--start", "2262-04-11T23:47:10"), "years 1678 to 2262"),
     "no worker": (_bad_log("--workers", "0"), "--workers"),
 }
 

@@ -159,3 +159,16 @@ def test_even_samples_have_no_steps_that_recur(stamps):
 def test_a_multiple_of_the_rate_is_not_taken_for_it():
     with pytest.raises(TimeError, match=r"200 Hz.*100 Hz"):
         regularise(raw_log(stamps_of(np.arange(2000), 100.0)), rate=200.0)
+
+
+@pytest.mark.parametrize("rows", [1000, 5000])
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("group", [4, 5])
+@pytest.mark.parametrize("period_ms", [1, 4, 10])
+def test_even_stamps_and_then_shared_ones(rows: int, share: float, group: int, period_ms: int) -> None:
+    """A logger that falls behind: even stamps at first, then groups of rows that share one. The rate is the same all along."""
+    even = round(rows * (1 - share))
+    shared = even - 1 + group * (1 + np.arange(rows - even) // group)
+    stamps = np.concatenate([np.arange(even), shared]) * period_ms * 1_000_000
+    found = estimate_rate(lambda: iter([(np.arange(rows), stamps)]), where="tool.csv")
+    assert found.rate == pytest.approx(1000 / period_ms, rel=2e-3)

@@ -10,7 +10,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.limits import check_limits
-from gyrostab.timegrid import stamp_ns
+from gyrostab.timegrid import check_rate, stamp_ns
 
 __all__ = ["ColumnSummary", "FileSummary", "ReadOptions"]
 
@@ -66,8 +66,8 @@ class ReadOptions:
     limits: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.rate is not None and not (np.isfinite(self.rate) and self.rate > 0):
-            raise OptionError(f"--rate {self.rate:g}: the sampling rate is a number of Hz above 0")
+        if self.rate is not None:
+            check_rate(self.rate, "--rate")
         if self.kind not in (None, "rate", "angle"):
             raise OptionError(f"--kind {self.kind}: choose 'rate' (increment of each sample) or 'angle' (cumulative angle)")
         for name in ("start", "epoch"):

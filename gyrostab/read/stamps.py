@@ -55,6 +55,8 @@ _ISO = re.compile(r"^\s*\d{4}-?\d\d-?\d\d([T ]\d\d(:?\d\d){0,2}([.,]\d+)?\s*(Z|[
 _SINCE = re.compile(r"\bsince\b", re.IGNORECASE)
 #: Calendars in which a date is an instant; the others are those of climate models, whose dates never were.
 _CALENDARS = {"standard": "standard", "gregorian": "standard", "proleptic_gregorian": "proleptic_gregorian", "julian": "julian"}
+#: Characters of a cell above which it is no stamp: a double written in full has at most 325 before and 1074 after the point.
+_MOST_DIGITS = 1400
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?$")
 
 
@@ -109,12 +111,12 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     epoch = _epoch_ns(text, since[0], calendar) if since else None
     factor, _, bare = name.rpartition(" ")
     ns = None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))  # Ms: a megasecond, or a slip
-    if ns is None or (factor and not _NUMBER.match(factor.strip())):
+    if ns is None or (factor and not (len(factor) <= _MOST_DIGITS and _NUMBER.match(factor.strip()))):
         known = "s, ms, us, ns, min, h, d, week, with a factor in front if needed"
         raise UnitError(f"time unit {text!r} is not known; known are {known}; months and years have no fixed length")
     scale = Fraction(factor.strip() or "1")
-    if scale <= 0:
-        raise UnitError(f"time unit {text!r}: the factor {factor} is not usable; give a number above 0")
+    if not 0 < ns * scale < 2**63 or (ns * scale).denominator >= 2**63:
+        raise UnitError(f"time unit {text!r}: the factor {factor} is not usable; give a number above 0, of less than 292 years")
     return TimeUnit(text, ns * scale, epoch)
 
 
@@ -217,7 +219,7 @@ def cells_to_ns(cells: Sequence[str], unit: TimeUnit | None, epoch: int) -> NDAr
     stamps = np.full(len(cells), NAT, dtype=np.int64)
     for index, cell in enumerate(cells):
         text = cell.strip()
-        if _NUMBER.match(text):
+        if len(text) <= _MOST_DIGITS and _NUMBER.match(text):
             value = Fraction(text) * unit.ns
             nanoseconds = round(value) + zero
             if abs(nanoseconds) <= _LIMIT:

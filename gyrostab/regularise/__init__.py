@@ -5,7 +5,6 @@ No value is ever interpolated, averaged or moved by a fraction of a sample: a sa
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -27,7 +26,7 @@ from gyrostab.regularise.repeats import find_repeats, with_repeats
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name, texts
 from gyrostab.store import chunk_samples
-from gyrostab.timegrid import stamp_ns, time_coordinate
+from gyrostab.timegrid import check_rate, check_span, stamp_ns, time_coordinate
 from gyrostab.windows import duration_seconds
 
 __all__ = ["gap_table", "regularise"]
@@ -38,8 +37,8 @@ _OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "h
 
 
 def _checked(*, rate: float | None, tolerance: float, chunk: int | None, block: int) -> None:
-    if rate is not None and not (math.isfinite(rate) and rate > 0):
-        raise OptionError(f"rate={rate!r} is not a sampling rate; give a number of Hz above 0")
+    if rate is not None:
+        check_rate(rate, "rate")
     if not 0 <= tolerance < 0.5:
         raise OptionError(f"tolerance={tolerance!r} must be at least 0 and below 0.5 samples")
     if (chunk is not None and chunk < 1) or block < 64:
@@ -210,6 +209,7 @@ def regularise(
     notes: list[str] = []
     placement, hertz = _place(raw, found, _declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block, notes=notes)
     check_grid(raw, placement, hertz, gap_limit, allowed)
+    check_span(placement.start, hertz, placement.size, file_of(raw)[0])
     chunk = chunk or chunk_samples(hertz)
     table = name_lost(find_gaps(placement, found), raw.attrs.get("unreadable_spans", ()), placement.start, hertz)
     notes += describe(raw, found, placement, table, hertz)

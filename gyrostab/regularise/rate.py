@@ -185,16 +185,30 @@ def _throughput(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float
     rates = []
     for part in parts:
         steps = np.diff(part).astype(np.float64)
-        rising = np.flatnonzero(steps > 0)
-        if ticks and len(rising) > 1:
-            steps = steps[rising[0] + 1 : rising[-1] + 1]
-        usual = np.median(steps[steps > 0]) if (steps > 0).any() else SECOND
-        good = (steps >= 0) & (steps <= max(SECOND, 1000 * usual) if not ticks else steps <= 3 * usual)
-        if good.any() and steps[good].sum() > 0:
-            rates.append((steps[good].sum(), good.sum()))
-    times, counts = np.array(rates, dtype=np.float64).T
-    whole = counts >= 0.5 * counts.max()
-    return float(np.median(times[whole] / counts[whole]))
+        if ticks and (steps > 0).sum() > 1:
+            times, counts = _ticks(steps)
+        else:
+            usual = np.median(steps[steps > 0]) if (steps > 0).any() else SECOND
+            good = (steps >= 0) & (steps <= max(SECOND, 1000 * usual))
+            times, counts = float(steps[good].sum()), int(good.sum())
+        if times > 0 and counts > 0:
+            rates.append((times, counts))
+    found = np.array(rates, dtype=np.float64)
+    whole = found[:, 1] >= 0.5 * found[:, 1].max()
+    return float(np.median(found[whole, 0] / found[whole, 1]))
+
+
+def _ticks(steps: NDArray[np.float64]) -> tuple[float, int]:
+    """Time [ns] and rows between changes of a shared stamp; changes that take three times as long a row as usual are gaps.
+
+    A change and the rows that share the stamp before it are kept or left out together: some stamps may be shared by one row and
+    others by five.
+    """
+    rising = np.flatnonzero(steps > 0)
+    times, counts = steps[rising[1:]], np.diff(rising)
+    paces = times / counts
+    good = paces <= 3 * np.median(np.repeat(paces, counts))
+    return float(times[good].sum()), int(counts[good].sum())
 
 
 def _longest(parts: list[NDArray[np.int64]], period: float) -> float:
@@ -250,7 +264,7 @@ def _pooled(pieces: NDArray[np.float64], period: float, counted: bool) -> tuple[
     if sane.any():
         period = float(ct[sane].sum() / cc[sane].sum())
     error = 3.0 * noise / np.sqrt(cc[sane].sum() if sane.any() else cc.sum())
-    if counted:
+    if counted or not sane.any():  # no piece has the period that was begun with: nothing to join
         return period, error, float(n.max())
     return _joined(pieces[sane], period, error, noise)
 
