@@ -26,7 +26,7 @@ from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.tables import Table, read_tables, scan_tables
 
-__all__ = ["matches", "read", "scan"]
+__all__ = ["has_layout", "matches", "read", "scan"]
 
 SUFFIXES = (".bin", ".raw")
 TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
@@ -34,7 +34,12 @@ TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64
 
 def matches(path: Path) -> bool:
     """Whether a layout for it stands beside the file, or it is called ``.bin`` or ``.raw``."""
-    return path.is_file() and path.suffix.lower() != ".toml" and (path.suffix.lower() in SUFFIXES or _named(path).is_file())
+    return path.is_file() and path.suffix.lower() != ".toml" and (path.suffix.lower() in SUFFIXES or has_layout(path))
+
+
+def has_layout(path: Path) -> bool:
+    """Whether a layout of its own stands beside a file."""
+    return _named(path).is_file()
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:

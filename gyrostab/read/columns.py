@@ -91,6 +91,7 @@ def plan_columns(
     rising: Callable[[int], bool] | None = None,
     above: Sequence[str] = (),
     is_filled: Callable[[int], bool] | None = None,
+    coded: Mapping[int, str] | None = None,
 ) -> Plan:
     """Decide what each column is.
 
@@ -114,6 +115,8 @@ def plan_columns(
         Lines above the header, which may tell the program that wrote the file.
     is_filled : callable, optional
         Says of a column whether its first cells hold anything.
+    coded : mapping of int to str, optional
+        What columns are by a code of the format, in the form of ``--map``, which is stronger.
 
     Returns
     -------
@@ -122,7 +125,7 @@ def plan_columns(
     """
     preset = _known_program(path, headers, above, is_filled)
     work = _Work(path, options, rising or (lambda source: True))
-    named = work.name(headers, units or {}, calendars or {}, frozenset(stamped), preset.columns)
+    named = work.name(headers, units or {}, calendars or {}, frozenset(stamped), {**(coded or {}), **preset.columns})
     named = work.separate(named)
     time = work.find_time(named)
     rest = [column for column in named if column is not time]
@@ -133,6 +136,8 @@ def plan_columns(
     if preset.name:
         told = f", and {rate:g} Hz by the lines above the header" if rate else ""
         work.notes.insert(0, f"read as a file of {preset.name}{told}; --map, --unit and --rate overrule it")
+    elif found := [f"{c.header} is {c.name}" for c in named if c.preset and AXIS.match(c.low)]:
+        work.notes.append(f"rotation by their codes: {_listing(found)}; --map overrules it")
     if time is None and options.rate is None and rate is None and not work.problems:
         message = f"{path.name}: there is no time column; give the sampling rate with --rate HZ (and --start)"
         work.problems.append(OptionError(f"{message}, or name the column: --map NAME=time. Columns: {_listing(headers)}"))

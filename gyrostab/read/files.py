@@ -18,12 +18,14 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError, reading_of
 from gyrostab.join import join_logs, log_span
+from gyrostab.read.binary import has_layout
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.combine import attach_channels, concatenate, memory, to_disk
 from gyrostab.read.lost import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.overlap import stamp_span
 from gyrostab.read.pieces import Spool
+from gyrostab.read.unread import refuse_unread
 from gyrostab.schema import texts
 
 __all__ = ["OnFile", "Reader", "read_log", "readers", "scan_file"]
@@ -69,6 +71,8 @@ def _reader(path: Path) -> Reader:
     """The reader of a file; text is tried last, as it is the least particular."""
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
+    if not has_layout(path):
+        refuse_unread(path)
     for name in sorted(_registered(), key=lambda name: (name == "text", name)):
         reader = cast(Reader, _registered()[name].load())
         if reader.matches(path):

@@ -24,6 +24,10 @@ from gyrostab.read.packing import ATTRIBUTES, fold_packing, text_attributes
 __all__ = ["matches", "read", "scan"]
 
 HDF_SUFFIXES = (".h5", ".hdf5")
+_PLAIN_ARRAYS = (
+    "of a timeseries ts: s.time = ts.Time; s.data = ts.Data; save('log.mat', '-struct', 's'); "
+    "of a table or timetable: writetable(T, 'log.csv') or writetimetable(T, 'log.csv')"
+)
 #: A matrix with more columns than this is no table of sensors.
 MAX_COLUMNS = 64
 
@@ -70,15 +74,19 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
 
 
 def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vector], Plan, Fetch, list[str]]:
-    found = [vector for name, array in _arrays(path, stack) for vector in _vectors(name, array)]
+    objects: list[str] = []
+    found = [vector for name, array in _arrays(path, stack, objects) for vector in _vectors(name, array)]
+    if not found and objects:
+        what = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
+        raise FormatError(f"{path.name}: {what}; save plain arrays instead: {_PLAIN_ARRAYS}")
     if not found:
-        raise FormatError(
-            f"{path.name}: there is no vector or matrix of numbers in it (tables and objects are not read; save plain arrays)"
-        )
+        raise FormatError(f"{path.name}: there is no vector or matrix of numbers in it; save plain arrays")
     rows = max(vector.rows for vector in found)
     kept = [vector for vector in found if vector.rows == rows]
     others = [vector.header for vector in found if vector.rows != rows]
     notes = [f"left out, as they are shorter than the {rows} rows of the longest: {', '.join(others[:20])}"] if others else []
+    if objects:
+        notes.append(f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to keep it, {_PLAIN_ARRAYS}")
     attributes = [_attributes(vector.array) for vector in kept]
     units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
     plan = plan_columns(path, [vector.header for vector in kept], options, units=units, calendars=calendars)
@@ -102,11 +110,12 @@ def _vectors(name: str, array: Any) -> Iterator[_Vector]:
         yield _Vector(name, array, None, int(np.argmax(shape)))
 
 
-def _arrays(path: Path, stack: ExitStack) -> Iterator[tuple[str, Any]]:
+def _arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
+    """Arrays of numbers by their names; what is an object of MATLAB is added to `objects`."""
     with path.open("rb") as file:
         head = file.read(1024)
     if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
-        yield from _arrays_hdf(path, stack)
+        yield from _arrays_hdf(path, stack, objects)
         return
     from scipy.io import loadmat
 
@@ -116,18 +125,36 @@ def _arrays(path: Path, stack: ExitStack) -> Iterator[tuple[str, Any]]:
         raise FormatError(f"{path.name}: this MATLAB file cannot be read ({error}); it may be cut off, copy it again") from error
     for name, value in content.items():
         if not name.startswith("__"):
-            yield from _flatten(name, value)
+            yield from _flatten(name, value, objects)
 
 
-def _flatten(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
-        for field in value.dtype.names:
-            yield from _flatten(f"{name}.{field}", value.reshape(-1)[0][field])
+def _flatten(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, Any]]:
+    from scipy.io.matlab import MatlabObject, MatlabOpaque
+
+    fields = value.dtype.names if isinstance(value, np.ndarray) else None
+    if isinstance(value, MatlabOpaque):
+        entry = value.reshape(-1)[0] if value.size else None
+        kind = _text(entry["s2"]) if entry is not None and fields and "s2" in fields else "object"
+        objects.append(f"a {kind}" + (f" {_text(entry['s0'])!r}" if entry is not None and fields and "s0" in fields else ""))
+    elif isinstance(value, MatlabObject):
+        objects.append(f"an object of class {value.classname!r}")
+    elif fields and value.size == 1:
+        for field in fields:
+            yield from _flatten(f"{name}.{field}", value.reshape(-1)[0][field], objects)
+    elif fields and value.size > 1:  # table2struct: one structure a row
+        for field in fields:
+            cells = [np.asarray(cell) for cell in value[field].reshape(-1)]
+            if all(cell.size == 1 and cell.dtype.kind in "biuf" for cell in cells):
+                yield f"{name}.{field}", np.array([cell.item() for cell in cells])
     elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         yield name, value
 
 
-def _arrays_hdf(path: Path, stack: ExitStack) -> Iterator[tuple[str, Any]]:
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _arrays_hdf(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
     import h5py
 
     try:
@@ -140,6 +167,9 @@ def _arrays_hdf(path: Path, stack: ExitStack) -> Iterator[tuple[str, Any]]:
     def visit(name: str, item: Any) -> None:
         text = item.attrs.get("MATLAB_class", b"double")
         kind = text.decode() if isinstance(text, bytes) else str(text)
+        if "MATLAB_object_decode" in item.attrs and not name.startswith("#"):
+            objects.append(f"a {kind} {name!r}")
+            return
         if isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and kind != "char" and not name.startswith("#"):
             found.append((name.replace("/", "."), item))
 

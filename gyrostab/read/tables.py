@@ -28,7 +28,7 @@ class Table:
     """Columns of one length.
 
     `names` and `units` are those of the columns; `stamps` are in the unit `time_unit`, or dates where that is None; without stamps
-    a column of the table may hold the time.
+    a column of the table may hold the time. `coded` is what a column is by a code of the format, in the form of ``--map``.
     """
 
     rows: int
@@ -37,6 +37,7 @@ class Table:
     columns: tuple[Part, ...]
     stamps: Part | None = None
     time_unit: str | None = None
+    coded: tuple[str | None, ...] = ()
 
 
 def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
@@ -81,6 +82,7 @@ def _plan(path: Path, tables: Sequence[Table], options: ReadOptions) -> _Planned
         raise FormatError(f"{path.name}: it holds no values; copy it again, or look at what the logger wrote")
     headers: list[str] = []
     units: dict[int, str] = {}
+    coded: dict[int, str] = {}
     first = []
     for table in kept:
         first.append(len(headers))
@@ -90,9 +92,10 @@ def _plan(path: Path, tables: Sequence[Table], options: ReadOptions) -> _Planned
         for offset, unit in enumerate(table.units, 1):
             if unit:
                 units[len(headers) + offset] = unit
+        coded.update({len(headers) + offset: meaning for offset, meaning in enumerate(table.coded, 1) if meaning})
         headers += ["time" if named else "", *table.names]
     stamped = [begin for begin, table in zip(first, kept, strict=True) if table.stamps is not None and table.time_unit is None]
-    plan = plan_columns(path, headers, options, units=units, stamped=stamped)
+    plan = plan_columns(path, headers, options, units=units, stamped=stamped, coded=coded)
     wanted = plan.of("gyro") or plan.of("channel")
     holders = {max(place for place, begin in enumerate(first) if begin <= column.source): column.header for column in wanted}
     if plan.of("gyro") and len(holders) > 1:

@@ -1,0 +1,168 @@
+"""Formats as other programs leave them: cut off, with codes for names, in objects that only their maker reads."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyrostab.errors import FormatError, MissingUnitError
+from gyrostab.read import read_log, scan_file
+
+RATE = 50.0
+ROWS = 3000
+START = np.datetime64("2026-03-01T12:00:00", "ns")
+VALUES = np.random.default_rng(11).integers(-20000, 20000, (3, ROWS)).astype(np.int32)
+
+
+def write_miniseed(path: Path, codes: str = "ENZ", band: str = "H") -> bytes:
+    """Channels of a rotation sensor, one after the other as archives keep them."""
+    from pymseed import DataEncoding, MS3TraceList
+
+    with path.open("wb") as file:
+        for code, values in zip(codes, VALUES, strict=True):
+            traces = MS3TraceList()
+            traces.add_data(f"FDSN:XX_TOOL__{band}_J_{code}", values, "i", RATE, starttime=int(START.astype(np.int64)))
+            for record in traces.generate(max_record_length=512, encoding=DataEncoding.STEIM2, format_version=2):
+                file.write(record)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(("codes", "band"), [("ENZ", "H"), ("123", "B"), ("XYZ", "L")])
+def test_rotation_channels_of_miniseed_are_axes(tmp_path: Path, codes: str, band: str) -> None:
+    path = tmp_path / "a.mseed"
+    write_miniseed(path, codes, band)
+    with pytest.raises(MissingUnitError, match="--unit gyro="):
+        read_log(path)
+    raw = read_log(path, unit={"gyro": "0.5 deg/h"})
+    assert raw.axis.values.tolist() == sorted(codes.lower())
+    assert np.array_equal(raw.rate.values, VALUES * 0.5)
+    assert any(f"{band}J{codes[0]} is gyro_{codes[0].lower()}" in note for note in raw.attrs["notes"])
+    mapped = read_log(path, map={f"{band}J{codes[2]}": "gyro_w"}, unit={"gyro": "0.5 deg/h"})
+    assert mapped.axis.values.tolist() == ["w"]
+
+
+@pytest.mark.parametrize("cut", [1, 100, 470, 511, 512, 900])
+def test_miniseed_that_is_cut_keeps_its_complete_records(tmp_path: Path, cut: int) -> None:
+    whole, path = tmp_path / "a.mseed", tmp_path / "b.mseed"
+    data = write_miniseed(whole)
+    path.write_bytes(data[:-cut])
+    raw = read_log(path, unit={"gyro": "0.5 deg/h"})
+    assert raw.sizes["row"] == ROWS
+    assert np.array_equal(raw.rate.sel(axis=["e", "n"]).values, VALUES[:2] * 0.5)
+    last = raw.rate.sel(axis="z").values
+    held = np.isfinite(last)
+    assert ROWS / 2 < held.sum() < ROWS
+    assert held[: held.sum()].all()
+    assert np.array_equal(last[held], VALUES[2, : held.sum()] * 0.5)
+    noted = any("cut off in its last record" in note for note in raw.attrs["notes"])
+    assert noted == (cut % 512 != 0)
+    assert any("cut off" in note for note in scan_file(path).notes) == noted
+
+
+def write_las(path: Path, date: str, clock: str, rows: list[str]) -> Path:
+    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 9 :\nSTEP.S 0 :\nNULL. -999.25 :\n"
+    curves = f"~C\nDATE.{date} : date\nTIME.{clock} : time\nGYRO_X.deg/h : rate\nTEMPERATURE.degC : in the tool\n~A\n"
+    path.write_text(head + curves + "".join(f"{row} 1.5 60\n" for row in rows))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("date", "clock", "rows"),
+    [
+        ("D", "S", ["14-Mar-26 23:59:59", "15-Mar-26 00:00:00.500"]),
+        ("", "", ["2026-03-14 23:59:59", "2026-03-15 00:00:00.500"]),
+        ("", "HHMMSS", ["20260314 235959", "20260315 000000.5"]),
+        ("", "S", ["20260314 86399", "20260315 0.5"]),
+        ("DD/MM/YY", "", ["14/03/26 23:59:59", "15/03/26 00:00:00.500"]),
+        ("MM/DD/YYYY", "", ["03/14/2026 23:59:59", "03/15/2026 00:00:00.500"]),
+        ("", "", ["14/03/2026 23:59:59", "15/03/2026 00:00:00.500"]),
+    ],
+)
+def test_date_and_time_curves_of_las_are_the_time(tmp_path: Path, date: str, clock: str, rows: list[str]) -> None:
+    raw = read_log(write_las(tmp_path / "a.las", date, clock, rows))
+    assert raw.time.values.astype(str).tolist() == ["2026-03-14T23:59:59.000000000", "2026-03-15T00:00:00.500000000"]
+    assert raw.rate[0].values.tolist() == [1.5, 1.5]
+    assert list(raw.data_vars) == ["rate", "temperature"]
+
+
+def test_dates_whose_order_is_not_clear_are_refused(tmp_path: Path) -> None:
+    path = write_las(tmp_path / "a.las", "", "S", ["03/04/2026 1", "03/05/2026 2"])
+    with pytest.raises(FormatError, match=r"order of day and month.*--map DATE=-"):
+        read_log(path)
+    assert read_log(path, map={"DATE": "-"}).sizes["row"] == 2
+
+
+def matlab_element(kind: int, data: bytes) -> bytes:
+    return struct.pack("<II", kind, len(data)) + data + b"\0" * (-len(data) % 8)
+
+
+def write_timeseries(path: Path) -> None:
+    """A MATLAB 5 file with a timeseries `ts`: an object, whose values are where MATLAB alone finds them."""
+    inner = matlab_element(6, struct.pack("<II", 13, 0)) + matlab_element(5, struct.pack("<ii", 6, 1)) + matlab_element(1, b"")
+    inner += matlab_element(6, struct.pack("<6I", 0xDD000000, 2, 1, 1, 1, 1))
+    body = matlab_element(6, struct.pack("<II", 17, 0)) + b"".join(matlab_element(1, text) for text in (b"ts", b"MCOS", b"timeseries"))
+    head = b"MATLAB 5.0 MAT-file, made by hand".ljust(116) + b"\0" * 8 + struct.pack("<HH", 0x0100, 0x4D49)
+    path.write_bytes(head + matlab_element(14, body + matlab_element(14, inner)))
+
+
+def test_a_matlab_timeseries_says_what_can_be_done(tmp_path: Path) -> None:
+    write_timeseries(tmp_path / "ts.mat")
+    with pytest.raises(FormatError, match=r"a timeseries 'ts'.*MATLAB alone.*ts\.Data") as caught:
+        read_log(tmp_path / "ts.mat")
+    assert "None" not in str(caught.value)
+
+
+def test_a_matlab_object_of_version_7_3_is_named(tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "tt.mat", "w") as file:
+        file["tt"] = np.zeros(6, dtype=np.uint32)
+        file["tt"].attrs["MATLAB_class"] = np.bytes_("timetable")
+        file["tt"].attrs["MATLAB_object_decode"] = np.int32(3)
+    with pytest.raises(FormatError, match=r"a timetable 'tt'.*writetimetable"):
+        read_log(tmp_path / "tt.mat")
+
+
+def test_a_matlab_table_saved_as_structures_is_read(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    rows = np.zeros((3, 1), dtype=[("time", object), ("gx", object)])
+    for row in range(3):
+        rows[row, 0] = (np.array([[row / 10]]), np.array([[row * 2.0]]))
+    savemat(tmp_path / "s.mat", {"S": rows})
+    raw = read_log(tmp_path / "s.mat", map={"S.time": "time [s]", "S.gx": "gyro_x [deg/h]"})
+    assert raw.rate[0].values.tolist() == [0, 2, 4]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("flight.bin", b"\xa3\x95\x80\x80\x59FMT\0" + bytes(80), r"ArduPilot DataFlash.*mavlogdump.*GyrX=gyro_x"),
+        ("flight.log", b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\nIMU, 1, 2, 3\n", "ArduPilot DataFlash"),
+        ("log.xml", b'<?xml version="1.0"?>\n<logs xmlns="http://www.witsml.org/schemas/1series" version="1.4.1.1">', "WITSML.*LAS or CSV"),
+        ("a.gps", b"\xaa\x44\x12\x1c" + bytes(100), "NovAtel.*RAWIMU"),
+        ("a.log", b"#RAWIMUSA,COM1,0,0.0,FINESTEERING,1936,1.0,0,0,0;1936,1.0,77,1,2,3,4,5,6*00000000\r\n" * 3, "NovAtel"),
+        ("a.txt", b"%RAWIMUSA,1936,1.002;1936,1.0,77,1,2,3,4,5,6*00000000\r\n" * 3, "NovAtel"),
+        ("x.rda", gzip.compress(b"RDX3\nX\n" + bytes(200), mtime=0), r"R data.*write\.csv"),
+        ("x.csv", b"RDX2\nX\n" + bytes(200), "R data"),
+        ("a.bag", b"#ROSBAG V2.0\n" + bytes(100), "ROS bag.*rostopic echo -b a.bag -p"),
+        ("a.mcap", b"\x89MCAP0\r\n" + bytes(100), "MCAP"),
+        ("a.db3", b"SQLite format 3\0" + bytes(100), "SQLite"),
+    ],
+)
+def test_known_formats_that_are_not_read_are_named(tmp_path: Path, name: str, data: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(data)
+    for look in (read_log, scan_file):
+        with pytest.raises(FormatError, match=message):
+            look(tmp_path / name)
+
+
+def test_a_layout_of_its_own_is_stronger_than_a_signature(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"\xa3\x95\x80\x80" * 10)
+    path.with_name("a.bin.toml").write_text('fields = [{name = "gyro_x [deg/h]", type = "int32"}]')
+    assert read_log(path, rate=1.0).sizes["row"] == 10
