@@ -7,6 +7,7 @@ order does not matter.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -21,15 +22,21 @@ from gyrostab.units import INNER
 __all__ = ["LightPowerNoise", "TemperatureNoise", "VibrationNoise", "VibrationRandomWalk"]
 
 
+#: Least N^2 of a law that is a polynomial, as a share of its value at the reference: a tenth of N. Beyond the range where such a law was
+#: measured it would cross zero, which no noise does.
+LEAST_SHARE = 0.01
+
+
 def _raised(effect: Effect, chunk: Chunk, share: Array) -> dict[str, Array]:
-    """Squared N, more by a share of what the model says."""
-    if share.size and float(share.min()) < -1.0:
-        place = int(share.argmin())
-        driver = next(iter(chunk.drivers))
-        raise OptionError(
-            f"effect {effect.name!r}: N^2 would be negative where {effect.channel_names()[driver]} is {chunk.drivers[driver][place]:.6g}, "
-            f"{chunk.seconds[place]:.6g} s after the start; give smaller coefficients or another reference"
+    """Raise squared N by a share of what the model says, down to `LEAST_SHARE` of it."""
+    if share.size and float(share.min()) < LEAST_SHARE - 1.0:
+        driver = effect.channel_names()[next(iter(chunk.drivers))]
+        warnings.warn(
+            f"effect {effect.name!r}: its law gives less than {LEAST_SHARE:.0%} of N^2 at some values of {driver}, and less than nothing "
+            f"beyond; {LEAST_SHARE:.0%} is taken there. Give smaller coefficients or another reference for another law",
+            stacklevel=2,
         )
+        share = np.maximum(share, LEAST_SHARE - 1.0)
     return {"N": chunk.level["N"] + chunk.setup.noise["N"][:, None] ** 2 * share}
 
 
@@ -37,7 +44,7 @@ def _raised(effect: Effect, chunk: Chunk, share: Array) -> dict[str, Array]:
 class TemperatureNoise(Effect):
     """Angle random walk that follows the temperature.
 
-    ``N^2(T) = N0^2 (1 + c1 (T - T0) + c2 (T - T0)^2)``, N0 of the model
+    ``N^2(T) = N0^2 (1 + c1 (T - T0) + c2 (T - T0)^2)``, N0 of the model; no less than 1 % of N0^2
 
     *DAVAR*: the whole slope -1/2 shifts up and down with the temperature, at once and the same on plateaus and ramps. *Window mean*:
     nothing. *Spectrum*: white, with a level that follows T. *Axes*: all alike where the source or the detectors' supply is at work.
@@ -144,7 +151,7 @@ class LightPowerNoise(Effect):
                 f"effect {self.name!r}: the channel {name!r} is {power[place]:g} W {when:.6g} s after the start; it must be above 0: "
                 "correct the channel, or leave its bad values out"
             )
-        return _raised(self, chunk, self._share(power)), state
+        return {"N": chunk.level["N"] + chunk.setup.noise["N"][:, None] ** 2 * self._share(power)}, state
 
     def _share(self, power: Array) -> Array:
         loss = self.nominal / power
