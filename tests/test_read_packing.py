@@ -79,6 +79,7 @@ CASES = {
         {"_Unsigned": "true", "_FillValue": np.int8(-97), "valid_range": np.array([101, -98], "i1"), "scale_factor": 0.5},
         np.where((BYTES == 159) | (BYTES == 100), np.nan, BYTES * 0.5),
     ),
+    "unsigned, limit beyond its type": (BYTES.view("i1"), {"_Unsigned": "true", "valid_max": np.int16(300)}, BYTES.astype(float)),
     "signed": (COUNTS.view("u2"), {"_Unsigned": "false", "scale_factor": 0.5}, COUNTS * 0.5),
 }  # fmt: skip
 

@@ -85,7 +85,8 @@ class Packing:
         found = {key: attributes[key] for key in _PACKING if key in attributes}
         if stored.kind in "iu" and (text := attribute_text(found.get("_Unsigned"))):
             stored = np.dtype(f"{'u' if text.lower() == 'true' else 'i'}{stored.itemsize}")
-        numbers = {key: _numbers(where, key, value, stored) for key, value in found.items() if key != "_Unsigned"}
+        wraps = "_Unsigned" in found
+        numbers = {key: _numbers(where, key, value, stored, wraps=wraps) for key, value in found.items() if key != "_Unsigned"}
         scale, offset = (
             float(numbers[key][0]) if key in numbers else neutral for key, neutral in (("scale_factor", 1.0), ("add_offset", 0.0))
         )
@@ -141,14 +142,19 @@ def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[
     return {place: text for place, attrs in enumerate(attributes) if (text := attribute_text(attrs.get(name)))}
 
 
-def _numbers(where: str, key: str, value: Any, stored: np.dtype[Any]) -> NDArray[Any]:
-    """Return the numbers of an attribute; signed ones of an unsigned variable by their bits, as the users guide has it."""
+def _numbers(where: str, key: str, value: Any, stored: np.dtype[Any], *, wraps: bool) -> NDArray[Any]:
+    """Return the numbers of an attribute; if `wraps`, signed ones of an unsigned variable are taken by their bits (users guide)."""
     array = np.atleast_1d(np.asarray(value)).ravel()
     if array.dtype.kind not in "iuf" or not array.size:
         raise FormatError(f"{where}: the attribute {key} is {value!r}, not a number; correct it or remove it")
     native = array.astype(array.dtype.newbyteorder("="))
-    reinterpreted = stored.kind in "iu" and native.dtype.kind in "iu" and native.dtype.itemsize == stored.itemsize
-    return native.view(stored) if reinterpreted and key not in ("scale_factor", "add_offset") else native
+    if not wraps or native.dtype.kind == "f" or key in ("scale_factor", "add_offset"):
+        return native
+    # By their bits, whatever type holds them: attributes of Zarr stores are JSON, whose whole numbers have none.
+    if stored.itemsize == 8:
+        return native.view(stored)
+    wide, bits = native.astype(np.int64), 8 * stored.itemsize
+    return np.where((wide >= -(1 << bits - 1)) & (wide < 1 << bits), wide.astype(stored), wide)
 
 
 def _representable(missing: Iterable[Any], stored: np.dtype[Any]) -> Iterable[Any]:
