@@ -6,16 +6,19 @@ import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import netCDF4
 import numpy as np
 import pytest
+import zarr
 
-from gyrostab import davar, make_log, read_log, regularise, scan, to_netcdf
+from gyrostab import davar, make_log, read_log, regularise, scan, to_netcdf, to_zarr
 from gyrostab.davar import davar_part
-from gyrostab.errors import OptionError, TimeError
+from gyrostab.errors import FormatError, OptionError, TimeError
 from gyrostab.limits import check_limits
-from gyrostab.read import ReadOptions, arrays
+from gyrostab.read import ReadOptions, arrays, matlab
 from gyrostab.read import netcdf as netcdf_reader
+from gyrostab.read.pieces import Spool
 
 
 def write_stamped_netcdf(path: Path, rows: int) -> Path:
@@ -41,12 +44,12 @@ def peak_of(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def test_foreign_netcdf_takes_no_more_memory_when_it_is_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_foreign_netcdf_takes_less_memory_than_its_stamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arrays, "BATCH_ROWS", 2**16)
-    short, long = (write_stamped_netcdf(tmp_path / f"{rows}.nc", rows) for rows in (300_000, 1_500_000))
-    netcdf_reader.read(short, ReadOptions(), limit=2**20)  # loads modules
-    peaks = [peak_of(lambda path=path: netcdf_reader.read(path, ReadOptions(), limit=2**20)) for path in (short, long)]
-    assert peaks[1] < peaks[0] + 2**21
+    rows = 1_500_000
+    path = write_stamped_netcdf(tmp_path / "log.nc", rows)
+    netcdf_reader.read(write_stamped_netcdf(tmp_path / "short.nc", 3000), ReadOptions(), limit=1000)  # loads modules
+    assert peak_of(lambda: netcdf_reader.read(path, ReadOptions(), limit=2**20)) < 8 * rows  # the stamps alone have that many
 
 
 def write_csv(path: Path, stamps_ns: np.ndarray) -> Path:
@@ -115,3 +118,155 @@ def test_limits_have_names_and_are_above_zero() -> None:
         check_limits({"columns": "-1"})
     with pytest.raises(OptionError, match="give a number of columns"):
         check_limits({"columns": "many"})
+
+
+ROWS = 5000
+STAMPS = START_NS + np.arange(ROWS) * 10_000_000 + np.random.default_rng(2).integers(-9000, 9000, ROWS)  # no even steps
+RATES = np.random.default_rng(3).integers(-900, 900, (3, ROWS)).astype(float)
+SINCE = "nanoseconds since 1970-01-01"
+
+
+def write_netcdf(path: Path, kind: str, layout: str) -> None:
+    with netCDF4.Dataset(path, "w", format=kind) as file:
+        file.createDimension("time", None if layout == "records" else ROWS)
+        file.createDimension("axis", 3)
+        options = {"zlib": True, "shuffle": True, "fletcher32": True} if layout == "chunks" else {}
+        chunks = {"chunksizes": (700,)} if layout == "chunks" else {}
+        time = file.createVariable("time", "i8" if kind != "NETCDF3_CLASSIC" else "f8", ("time",), **options, **chunks)
+        time.units = SINCE
+        dims = ("axis", "time") if layout == "axis first" else ("time", "axis")
+        gyro = file.createVariable("gyro", "i2", dims, **options, **({"chunksizes": (700, 2)} if options else {}))
+        gyro.units, gyro.scale_factor = "deg/h", 0.5
+        gyro.set_auto_scale(False)
+        time[:] = STAMPS
+        gyro[:] = RATES if layout == "axis first" else RATES.T
+
+
+def write_zarr(path: Path, version: int) -> None:
+    group = zarr.open_group(path, mode="w", zarr_format=version)
+    for name, values, chunks in (("time", STAMPS, (700,)), ("gyro", 0.5 * RATES.T, (700, 2))):
+        dims = ["time", "axis"][: values.ndim]
+        named = {"dimension_names": dims} if version == 3 else {}
+        array = group.create_array(name, data=values, chunks=chunks, **named)
+        array.attrs.update({"units": "deg/h" if values.ndim == 2 else SINCE} | ({} if named else {"_ARRAY_DIMENSIONS": dims}))
+
+
+def write_hdf5(path: Path, layout: str) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        options = {"chunks": (700, 1), "compression": "gzip"} if layout == "chunks" else {}
+        file.create_dataset("time", data=STAMPS[:, None], **options).attrs["units"] = SINCE
+        for axis, values in zip("xyz", RATES, strict=True):
+            file.create_dataset(f"gyro_{axis}", data=0.5 * values[:, None], **options).attrs["units"] = "deg/h"
+
+
+FOREIGN = {
+    "chunks.nc": lambda path: write_netcdf(path, "NETCDF4", "chunks"),
+    "even.nc": lambda path: write_netcdf(path, "NETCDF4", "even"),
+    "axis_first.nc": lambda path: write_netcdf(path, "NETCDF4", "axis first"),
+    "records.nc": lambda path: write_netcdf(path, "NETCDF3_64BIT_DATA", "records"),
+    "classic.nc": lambda path: write_netcdf(path, "NETCDF3_64BIT_DATA", "axis first"),
+    "two.zarr": lambda path: write_zarr(path, 2),
+    "three.zarr": lambda path: write_zarr(path, 3),
+    "chunks.h5": lambda path: write_hdf5(path, "chunks"),
+    "even.mat": lambda path: write_hdf5(path, "even"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_values_of_foreign_files_stay_in_the_file(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / name
+    FOREIGN[name](path)
+    monkeypatch.setattr(arrays, "BATCH_ROWS", 1024)
+    monkeypatch.setattr(Spool, "add", lambda *_: pytest.fail("a column was moved to a temporary file"))
+    reader = matlab if path.suffix in (".h5", ".mat") else netcdf_reader
+    whole, lazy = (reader.read(path, ReadOptions(), limit=limit) for limit in (2**27, 1000))
+    assert whole["rate"].chunks is None
+    assert lazy["rate"].chunks is not None
+    for raw in (whole, lazy):
+        np.testing.assert_array_equal(raw["rate"], 0.5 * RATES)
+        np.testing.assert_array_equal(raw["time"].values.astype(np.int64), STAMPS)
+    np.testing.assert_array_equal(regularise(lazy)["rate"], regularise(whole)["rate"])
+
+
+def test_windows_of_a_file_whose_values_stay_there_are_those_of_values_in_memory(tmp_path: Path) -> None:
+    path = write_stamped_netcdf(tmp_path / "log.nc", 300_000)
+    raw = netcdf_reader.read(path, ReadOptions(), limit=1000)
+    log = regularise(raw)
+    part = davar_part(log, part=slice(0, 5), window="60s", step="30s")
+    whole = davar(regularise(netcdf_reader.read(path, ReadOptions())), window="60s", step="30s")
+    np.testing.assert_array_equal(part["avar"], whole["avar"].isel(time=slice(0, 5)))
+
+
+def test_store_that_claims_samples_it_never_held_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "log.zarr"
+    write_zarr(path, 3)
+    group = zarr.open_group(path, mode="r+")
+    group["time"].resize((10**11,))
+    group["gyro"].resize((10**11, 3))
+    with pytest.raises(
+        FormatError, match=r"log\.zarr: it claims 1e\+11 samples in each of 4 columns, but holds .* bytes.*--limit stored_samples=4e\+11"
+    ):
+        read_log(path)
+
+
+@pytest.mark.parametrize("suffix", ["nc", "h5"])
+def test_file_of_unwritten_variables_is_refused(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"log.{suffix}"
+    with h5py.File(path, "w") as file:
+        for name, kind in (("time", "i8"), ("gyro_x", "f8")):
+            array = file.create_dataset(name, (10**11,), kind, chunks=(10**6,))
+            array.attrs["units"] = SINCE if name == "time" else "deg/h"
+            array[:1000] = np.arange(1000)
+        if suffix == "nc":
+            file["time"].make_scale("time")
+            file["gyro_x"].dims[0].attach_scale(file["time"])
+    with pytest.raises(FormatError, match=r"claims 1e\+11 samples .*--limit stored_samples=2e\+11"):
+        read_log(path)
+
+
+def test_own_log_that_claims_samples_it_never_held_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "log.zarr"
+    to_zarr(make_log(np.arange(200_000.0) % 7, rate=100.0, unit="deg/h"), path)
+    for name in (".zmetadata", "rate/.zarray"):
+        file = path / name
+        file.write_text(file.read_text().replace("200000", "100000000000"))
+    with pytest.raises(FormatError, match=r"log\.zarr: it claims 1e\+11 samples .*--limit stored_samples"):
+        read_log(path)
+
+
+@pytest.mark.parametrize("name", ["log.zarr", "log.nc", "log.h5"])
+def test_chunk_of_a_terabyte_is_refused_before_it_is_allocated(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    if name == "log.zarr":
+        group = zarr.open_group(path, mode="w", zarr_format=2)
+        for column in ("time", "gyro_x"):
+            group.create_array(column, shape=(1000,), chunks=(10**11,), dtype="f8").attrs["_ARRAY_DIMENSIONS"] = ["time"]
+    else:
+        with h5py.File(path, "w") as file:
+            for column in ("time", "gyro_x"):  # HDF5 itself allows 4 GiB
+                file.create_dataset(column, (1000,), "f8", chunks=(2**28,), maxshape=(None,))
+    with pytest.raises(FormatError, match=r"a chunk of '(time|gyro_x)' has .* bytes.*--limit chunk_bytes="):
+        read_log(path)
+
+
+def test_flipped_bytes_in_a_classic_header_take_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "log.nc"
+    write_netcdf(path, "NETCDF3_CLASSIC", "axis first")
+    netcdf_reader.scan(path, ReadOptions())  # loads modules
+    whole, header = bytearray(path.read_bytes()), 400
+    draw = np.random.default_rng(4)
+    refused = 0
+    for place in draw.integers(4, header, 60):
+        damaged = whole.copy()
+        damaged[place] ^= 0xFF
+        path.write_bytes(damaged)
+
+        def read() -> None:
+            nonlocal refused
+            try:
+                netcdf_reader.read(path, ReadOptions())
+            except (FormatError, OptionError, TimeError, ValueError):
+                refused += 1
+
+        assert peak_of(read) < 2**24
+    assert refused > 20

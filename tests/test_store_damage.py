@@ -19,6 +19,7 @@ import gyrostab.store.read as read_module
 from gyrostab.errors import DamageError, FormatError
 from gyrostab.export import open_log, open_product, to_netcdf, to_zarr
 from gyrostab.store.direct import fill_row
+from gyrostab.store.kept import KeptChunks
 from gyrostab.timegrid import time_coordinate
 
 from . import synthetic
@@ -81,7 +82,7 @@ def test_a_chunk_of_a_few_bytes_is_damaged(tmp_path, content):
 @pytest.mark.parametrize("form", WRITERS)
 def test_chunks_that_are_kept_take_no_more_memory_than_they_may(tmp_path, monkeypatch, form):
     """Parts of the same chunks, in turn: read once while they fit, read anew when others have taken their place."""
-    kept, chunk = read_module._Kept(4 * CHUNK * 2), 4 * CHUNK
+    kept, chunk = KeptChunks(4 * CHUNK * 2, 4 * CHUNK), 4 * CHUNK
     decoded = []
     monkeypatch.setattr(read_module, "_KEPT", kept)
     monkeypatch.setattr(read_module, "read_chunk", lambda *where, **how: decoded.append(where) or layout_module.read_chunk(*where, **how))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,17 @@ from numpy.typing import NDArray
 
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Column, Plan
-from gyrostab.read.intake import Intake, summary_of
+from gyrostab.read.intake import Intake, Taken, summary_of
 from gyrostab.read.options import FileSummary, ReadOptions
+from gyrostab.read.pieces import Steps, Stored
 from gyrostab.read.stamps import NAT, cells_to_ns, dates_to_ns, floats_to_ns, integers_to_ns, looks_iso, signed_counts
+from gyrostab.threads import in_order
 
-__all__ = ["Fetch", "holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
+__all__ = ["Fetch", "batch_rows", "convert_batch", "holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
 
+#: Rows and bytes of all columns that are taken at one time, at most.
 BATCH_ROWS = 2**20
+BATCH_BYTES = 2**26
 ENDS = 64
 
 #: Column number, first row, row after the last one -> values.
@@ -67,24 +72,84 @@ def holds_dates(values: Any) -> bool:
 
 
 def read_columns(
-    plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, *, notes: Sequence[str] = (), limit: int = SPILL_BYTES
+    plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, *, notes: Sequence[str] = (), limit: int = SPILL_BYTES, lasting: bool = False
 ) -> xr.Dataset:
-    """The raw log of columns that can be fetched by ranges of rows."""
+    """Make the raw log of columns that can be fetched by ranges of rows.
+
+    Parameters
+    ----------
+    plan : Plan
+        What each column is.
+    options : ReadOptions
+        What the user said.
+    rows : int
+        Number of rows.
+    fetch : callable
+        Column number, first row, row after the last one -> values.
+    notes : sequence of str
+        Notes of the reader.
+    limit : int
+        Size [bytes] above which the columns are not held in memory.
+    lasting : bool
+        Several threads may call `fetch`, and at any later time: then values above the limit stay in the file.
+    """
     intake = Intake(plan.check(), options, limit=limit)
-    for start in range(0, rows, BATCH_ROWS):
-        stop = min(start + BATCH_ROWS, rows)
-        take_batch(intake, options, {column.source: fetch(column.source, start, stop) for column in plan.columns})
+    stay = lasting and 8 * rows * len(plan.columns) > limit
+    if stay:
+        intake.tens = dict.fromkeys(intake.tens, 0.0)  # nothing is packed
+    step = batch_rows(len(plan.columns))
+    spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
+    take = partial(_take_rows, intake, plan, options, fetch, stay)
+    for taken in in_order(take, spans) if lasting else map(take, spans):
+        intake.add(taken)
     return intake.finish(notes)
 
 
-def take_batch(intake: Intake, options: ReadOptions, batch: dict[int, Any]) -> None:
-    """Convert one batch of columns and hand it to the intake."""
+def batch_rows(columns: int) -> int:
+    """Return how many rows are taken at one time.
+
+    Examples
+    --------
+    >>> batch_rows(4), batch_rows(1000)
+    (1048576, 8388)
+    """
+    return int(np.clip(BATCH_BYTES // (8 * max(columns, 1)), 2**10, BATCH_ROWS))
+
+
+def _take_rows(intake: Intake, plan: Plan, options: ReadOptions, fetch: Fetch, stay: bool, span: tuple[int, int]) -> Taken:
+    """Convert one batch; where the values stay in the file, only what was found in them is kept."""
+    taken = convert_batch(intake, options, {column.source: fetch(column.source, *span) for column in plan.columns})
+    if not stay:
+        return taken
+    begin, rows = span[0], taken.rows
+    block: dict[int, Any] = {}
+    for column in plan.columns:
+        piece = taken.block[column.source]
+        read = partial(_read_stamps if column.role == "time" else _read_values, column, options, fetch)
+        block[column.source] = piece if isinstance(piece, Steps) else Stored(read, begin, rows)
+    return taken._replace(block=block)
+
+
+def _read_values(column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int) -> NDArray[np.float64]:
+    from gyrostab.kernels.rows import clean_column
+
+    values, _ = to_floats(fetch(column.source, start, stop))
+    clean_column(values, column.factor, column.offset)
+    return values
+
+
+def _read_stamps(column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int) -> NDArray[np.int64]:
+    return to_stamps(fetch(column.source, start, stop), column, options)
+
+
+def convert_batch(intake: Intake, options: ReadOptions, batch: dict[int, Any]) -> Taken:
+    """Convert one batch of columns for the intake."""
     values, words = {}, 0
     for column in [*intake.gyro, *intake.channels]:
         values[column.source], odd = to_floats(batch[column.source])
         words += odd if column.role == "channel" else 0
     stamps = None if intake.time is None else to_stamps(batch[intake.time.source], intake.time, options)
-    intake.add(intake.prepare(values, stamps, words=words))
+    return intake.prepare(values, stamps, words=words)
 
 
 def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:

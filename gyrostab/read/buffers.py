@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.read.pieces import Piece, Pieces, Spool, Words
+from gyrostab.read.pieces import Piece, Pieces, Spool, Stored, Words
 from gyrostab.store.direct import stack_rows, with_fill
 
 __all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "lazily", "pieces_of", "put", "take", "together"]
@@ -83,7 +83,8 @@ class Buffers:
     def finish(self) -> dict[Any, NDArray[Any] | Pieces]:
         """The columns: arrays where they are small, or else in pieces."""
         found: dict[Any, NDArray[Any] | Pieces] = {}
-        small = self._spool is None and self.rows * len(self._pieces) <= _SMALL
+        stays = any(isinstance(piece, Stored) for pieces in self._pieces.values() for piece in pieces)
+        small = not stays and self._spool is None and self.rows * len(self._pieces) <= _SMALL
         matrix = np.empty((len(self.rows_of), self.rows if small else 0))
         for key, pieces in self._pieces.items():
             column = Pieces(self.dtypes[key], pieces)

@@ -5,9 +5,11 @@ The rows of a matrix run along its longer side. Fields of a structure are called
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
+from gyrostab.limits import check_chunk, check_stored
 from gyrostab.read.arrays import Fetch, float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.packing import ATTRIBUTES, fold_packing, text_attributes
+from gyrostab.store.rows import LibraryRows, Rows, hdf5_rows
 
 __all__ = ["matches", "read", "scan"]
 
@@ -34,22 +38,15 @@ MAX_COLUMNS = 64
 
 @dataclass(frozen=True)
 class _Vector:
-    """One column of the file: array, position across the long side (None for a vector), orientation."""
+    """One column of the file: the array that it is in, and where its numbers lie."""
 
     header: str
     array: Any  # numpy array or h5py dataset
-    place: int | None
-    along: int
+    stored: Rows
 
     @property
     def rows(self) -> int:
         return int(max(self.array.shape))
-
-    def part(self, start: int, stop: int) -> Any:
-        if self.array.ndim == 1:
-            return self.array[start:stop]
-        place = self.place or 0
-        return self.array[start:stop, place] if self.along == 0 else self.array[place, start:stop]
 
 
 def matches(path: Path) -> bool:
@@ -70,12 +67,14 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     with ExitStack() as stack:
         vectors, plan, fetch, notes = _look(path, options, stack)
         notes += float32_note(plan, [vector.array.dtype for vector in vectors])
-        return read_columns(plan, options, vectors[0].rows, fetch, notes=notes, limit=limit)
+        check_stored(path, vectors[0].rows, len(plan.columns), options.limits)
+        lasting = all(not isinstance(vectors[column.source].stored, LibraryRows) for column in plan.columns)
+        return read_columns(plan, options, vectors[0].rows, fetch, notes=notes, limit=limit, lasting=lasting)
 
 
 def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vector], Plan, Fetch, list[str]]:
     objects: list[str] = []
-    found = [vector for name, array in _arrays(path, stack, objects) for vector in _vectors(name, array)]
+    found = [vector for name, array in _arrays(path, stack, objects) for vector in _vectors(path, name, array, options)]
     if not found and objects:
         what = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
         raise FormatError(f"{path.name}: {what}; save plain arrays instead: {_PLAIN_ARRAYS}")
@@ -91,7 +90,7 @@ def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vec
     units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
     plan = plan_columns(path, [vector.header for vector in kept], options, units=units, calendars=calendars)
     plan, decoders = fold_packing(plan, [vector.array.dtype for vector in kept], attributes)
-    return kept, plan, lambda source, start, stop: decoders[source](kept[source].part(start, stop)), notes
+    return kept, plan, lambda source, start, stop: decoders[source](kept[source].stored.read(start, stop)), notes
 
 
 def _attributes(array: Any) -> dict[str, Any]:
@@ -100,14 +99,18 @@ def _attributes(array: Any) -> dict[str, Any]:
     return {name: attributes[name] for name in ATTRIBUTES if name in attributes}
 
 
-def _vectors(name: str, array: Any) -> Iterator[_Vector]:
+def _vectors(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[_Vector]:
     shape = array.shape
-    if len(shape) == 2 and min(shape) > 1:
-        along = int(np.argmax(shape))
-        if min(shape) <= MAX_COLUMNS:
-            yield from (_Vector(f"{name}/{place}", array, place, along) for place in range(min(shape)))
-    elif len(shape) in (1, 2) and max(shape, default=0) > 1:
-        yield _Vector(name, array, None, int(np.argmax(shape)))
+    if len(shape) not in (1, 2) or max(shape, default=0) <= 1:
+        return
+    if chunks := getattr(array, "chunks", None):
+        check_chunk(path, name, array.dtype.itemsize * math.prod(chunks), options.limits)
+    along, size = int(np.argmax(shape)), min(shape) if len(shape) == 2 else 1
+    locate = (None if isinstance(array, np.ndarray) else hdf5_rows(path, array)) or partial(LibraryRows, array)
+    if size == 1:
+        yield _Vector(name, array, locate(along, 0))
+    elif size <= MAX_COLUMNS:
+        yield from (_Vector(f"{name}/{place}", array, locate(along, place)) for place in range(size))
 
 
 def _arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:

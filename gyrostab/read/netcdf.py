@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,14 +19,18 @@ import xarray as xr
 
 from gyrostab.cf import from_disk
 from gyrostab.errors import FormatError, SchemaError
+from gyrostab.limits import check_stored
 from gyrostab.read.arrays import float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
+from gyrostab.read.classic import read_classic_header
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.read.packing import Decoder, decode_variables, fold_packing, text_attributes
 from gyrostab.read.stamps import names_epoch
+from gyrostab.read.variables import StoredVariable, open_variables, with_default_fill
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
 from gyrostab.store import name_file, open_stored, stored_attribute
+from gyrostab.store.rows import LibraryRows, Rows
 from gyrostab.timegrid import grid_times, time_coordinate
 from gyrostab.units import ON_DISK
 
@@ -41,14 +46,8 @@ _NO_LOGS = {"surface": "a dynamic Allan variance", "product": "a product"}
 @dataclass(frozen=True)
 class _Column:
     header: str
-    variable: Any
-    place: int | None
-    along: int
-
-    def part(self, start: int, stop: int) -> Any:
-        if self.place is None:
-            return self.variable[start:stop]
-        return self.variable[start:stop, self.place] if self.along == 0 else self.variable[self.place, start:stop]
+    variable: StoredVariable
+    rows: Rows
 
 
 def matches(path: Path) -> bool:
@@ -65,11 +64,10 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     if log is not None:
         with log:
             return _summarise_log(path, log)
-    import netCDF4
-
-    with netCDF4.Dataset(path) as file:
-        columns, rows, plan, decoders, notes = _look(path, file, options)
-        return summarise("netcdf", plan, options, rows, partial(_fetch, columns, decoders), notes)
+    with open_variables(path, options.limits) as variables:
+        columns, rows, plan, decoders, notes = _look(path, variables, options)
+        name = "zarr" if path.is_dir() else "netcdf"
+        return summarise(name, plan, options, rows, partial(_fetch, columns, decoders), notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
@@ -77,17 +75,19 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     log = _open_log(path, options)
     if log is not None:
         return log
-    import netCDF4
-
-    with netCDF4.Dataset(path) as file:
-        columns, rows, plan, decoders, notes = _look(path, file, options)
+    with open_variables(path, options.limits) as variables:
+        columns, rows, plan, decoders, notes = _look(path, variables, options)
         notes += float32_note(plan, [column.variable.dtype for column in columns])
+        check_stored(path, rows, len(plan.columns), options.limits)
+        lasting = all(not isinstance(columns[column.source].rows, LibraryRows) for column in plan.columns)
         fetch = partial(_fetch, columns, decoders)
-        return read_columns(plan, options, rows, fetch, notes=notes, limit=limit)
+        return read_columns(plan, options, rows, fetch, notes=notes, limit=limit, lasting=lasting)
 
 
 def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     """The file as a regular log, of gyrostab or with a stamp for each sample, or None when it is something else."""
+    if path.is_file():
+        read_classic_header(path)  # before the libraries take memory for what a damaged header claims
     content = _content(path)
     if content == "log":
         return _open_own(path, options)
@@ -103,11 +103,9 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     has_stamps = "time" in stored.variables and names_epoch(str(stored.variables["time"].attrs.get("units", "")))
     if not (has_signal and has_stamps and "sampling_rate_hz" in stored.attrs and "axis" in stored.variables):
         stored.close()
-        if path.is_dir():
-            raise FormatError(f"{path.name}: this Zarr store is no gyrostab log (axis and time, attribute sampling_rate_hz)")
         return None
     for variable in stored.variables.values() if engine == "netcdf4" else ():
-        variable.attrs = _with_default_fill(variable.attrs, variable.dtype)
+        variable.attrs = with_default_fill(variable.attrs, variable.dtype)
     log = _chunked(decode_variables(path.name, name_file(stored, path)))  # an index would hold every stamp in memory
     if path.is_dir():
         log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
@@ -119,6 +117,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
                 log[name].attrs["units"] = next(inner for inner, disk in ON_DISK.items() if disk == units)
         log = log.assign_coords(axis=np.array([str(axis) for axis in log["axis"].values], dtype=str))
         check_log(log)
+        check_stored(path, log.sizes["time"], log.sizes["axis"], options.limits)
     except SchemaError as error:
         raise SchemaError(f"{path.name}: {error}") from error
     for name in str(log.attrs.pop("json_attributes", "")).split():
@@ -151,6 +150,7 @@ def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
     log = from_disk(open_stored(path, strict=options.strict), path.name)
     try:
         check_log(log)
+        check_stored(path, log.sizes["time"], log.sizes["axis"], options.limits)
     except SchemaError as error:
         log.close()
         raise SchemaError(f"{path.name}: {error}") from error
@@ -200,59 +200,46 @@ def _stamp(log: xr.Dataset, place: int) -> np.datetime64:
 
 
 def _fetch(columns: list[_Column], decoders: dict[int, Decoder], source: int, start: int, stop: int) -> Any:
-    return decoders[source](columns[source].part(start, stop))
+    return decoders[source](columns[source].rows.read(start, stop))
 
 
-def _look(path: Path, file: Any, options: ReadOptions) -> tuple[list[_Column], int, Plan, dict[int, Decoder], list[str]]:
-    numeric = [v for v in file.variables.values() if getattr(v.dtype, "kind", "O") in "iuf" and v.ndim in (1, 2)]
-    lines = Counter(v.dimensions[0] for v in numeric if v.ndim == 1)
-    lines.update(max(v.dimensions, key=lambda d: len(file.dimensions[d])) for v in numeric if v.ndim == 2)
+def _look(
+    path: Path, variables: Mapping[str, StoredVariable], options: ReadOptions
+) -> tuple[list[_Column], int, Plan, dict[int, Decoder], list[str]]:
+    numeric = [v for v in variables.values() if v.dtype.kind in "iuf" and len(v.shape) in (1, 2)]
+    sizes = {dim: size for v in numeric for dim, size in zip(v.dimensions, v.shape, strict=True)}
+    lines = Counter(v.dimensions[0] for v in numeric if len(v.shape) == 1)
+    lines.update(max(v.dimensions, key=lambda d: sizes[d]) for v in numeric if len(v.shape) == 2)
     if not lines:
         raise FormatError(f"{path.name}: there is no variable of numbers along a dimension; groups are not looked into, so put it in none")
-    dim = max(lines, key=lambda d: (len(file.dimensions[d]), lines[d]))
+    dim = max(lines, key=lambda d: (sizes[d], lines[d]))
     columns: list[_Column] = []
     notes: list[str] = []
     left: list[str] = []
     for variable in numeric:
-        found = _columns(file, variable, dim)
+        found = _columns(variables, variable, dim)
         columns += found
         left += [] if found else [variable.name]
     if left:
         notes.append(f"left out, as they do not run along {dim!r} alone: {', '.join(left[:20])}")
-    attributes = [_attributes(column.variable) for column in columns]
+    attributes = [column.variable.attributes for column in columns]
     units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
     plan = plan_columns(path, [column.header for column in columns], options, units=units, calendars=calendars)
     plan, decoders = fold_packing(plan, [column.variable.dtype for column in columns], attributes)
-    return columns, len(file.dimensions[dim]), plan, decoders, notes
+    return columns, sizes[dim], plan, decoders, notes
 
 
-def _attributes(variable: Any) -> dict[str, Any]:
-    """Return the attributes of a variable, from which its stored numbers are decoded here."""
-    variable.set_auto_maskandscale(False)
-    return _with_default_fill({name: variable.getncattr(name) for name in variable.ncattrs()}, variable.dtype)
-
-
-def _with_default_fill(attributes: dict[str, Any], dtype: Any) -> dict[str, Any]:
-    """Add the fill value that the library gives to a variable without its own; bytes have none (users guide)."""
-    import netCDF4
-
-    if {"_FillValue", "_Unsigned"} & set(attributes) or dtype.kind not in "iuf" or dtype.itemsize == 1:
-        return attributes
-    return {**attributes, "_FillValue": dtype.type(netCDF4.default_fillvals[dtype.str[1:]])}
-
-
-def _columns(file: Any, variable: Any, dim: str) -> list[_Column]:
+def _columns(variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str) -> list[_Column]:
     if variable.dimensions == (dim,):
-        return [_Column(variable.name, variable, None, 0)]
-    if dim not in variable.dimensions or variable.ndim != 2:
+        return [_Column(variable.name, variable, variable.locate(0, 0))]
+    if dim not in variable.dimensions or len(variable.shape) != 2:
         return []
     along = variable.dimensions.index(dim)
-    other = variable.dimensions[1 - along]
-    size = len(file.dimensions[other])
+    other, size = variable.dimensions[1 - along], variable.shape[1 - along]
     if size > MAX_COLUMNS:
         return []
     labels = [str(place) for place in range(size)]
-    if other in file.variables:
-        labels = [str(label) for label in np.ma.getdata(file.variables[other][:])]
+    if other in variables and variables[other].shape == (size,):
+        labels = [str(label) for label in np.ma.getdata(variables[other].values[:])]
     stem = "gyro_" if variable.name.lower() in ("gyro", "rate") else f"{variable.name}/"
-    return [_Column(f"{stem}{label}", variable, place, along) for place, label in enumerate(labels)]
+    return [_Column(f"{stem}{label}", variable, variable.locate(along, place)) for place, label in enumerate(labels)]

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.read.arrays import BATCH_ROWS, float32_note, holds_dates, summarise, take_batch
+from gyrostab.read.arrays import batch_rows, convert_batch, float32_note, holds_dates, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.intake import Intake
@@ -44,9 +44,9 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     names = file.schema_arrow.names
     intake = Intake(plan.check(), options, limit=limit)
     wanted = [names[column.source] for column in plan.columns]
-    for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=wanted):
+    for batch in file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted):
         found = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
-        take_batch(intake, options, {column.source: _plain(found[names[column.source]]) for column in plan.columns})
+        intake.add(convert_batch(intake, options, {column.source: _plain(found[names[column.source]]) for column in plan.columns}))
     return intake.finish(float32_note(plan, file.schema_arrow.types))
 
 

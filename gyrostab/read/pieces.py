@@ -10,8 +10,8 @@ import os
 import tempfile
 import threading
 from bisect import bisect_right
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import IO, Any, Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
 
-__all__ = ["Counts", "Piece", "Pieces", "Spool", "Steps", "Words"]
+__all__ = ["Counts", "Piece", "Pieces", "Spool", "Steps", "Stored", "Words"]
 
 
 class Spool:
@@ -224,6 +224,47 @@ class Steps:
     def put(self, row: int, value: int) -> Piece:
         """The same with another value in one row, by its bits."""
         return _unpacked(self, np.int64).put(row, value)
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Values that stay in the file they came from, and are read and converted each time.
+
+    Attributes
+    ----------
+    read : callable
+        First row of the file, row after the last one -> values, converted.
+    begin, rows : int
+        First row of the file, and number of rows.
+    changes : dict
+        Row of the piece -> value that stands there instead, by its bits.
+    """
+
+    read: Callable[[int, int], NDArray[Any]]
+    begin: int
+    rows: int
+    changes: dict[int, int] = field(default_factory=dict)
+
+    @property
+    def held(self) -> int:
+        """Bytes in memory."""
+        return 0
+
+    def fill(self, first: int, out: NDArray[Any]) -> None:
+        """Put the values from row `first` on into `out`."""
+        out[:] = self.read(self.begin + first, self.begin + first + out.size).view(out.dtype)
+        for row, value in self.changes.items():
+            if first <= row < first + out.size:
+                out.view(np.int64)[row - first] = value
+
+    def spilled(self, spool: Spool) -> Piece:
+        """The same, which takes no memory."""
+        return self
+
+    def put(self, row: int, value: int) -> Piece:
+        """The same with another value in one row, by its bits."""
+        self.changes[row] = value
+        return self
 
 
 def _unpacked(piece: Piece, dtype: Any) -> Words:

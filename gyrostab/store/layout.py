@@ -22,7 +22,10 @@ from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.checksum import fletcher32
 from gyrostab.store.lock import library_lock
 
-__all__ = ["ChunkDamage", "decoded_chunk", "is_readable", "read_chunk", "stored_attribute", "zarr_codecs"]
+__all__ = [
+    "ChunkDamage", "decoded_chunk", "has_known_filters", "is_readable", "read_chunk", "read_written_chunk", "stored_attribute",
+    "zarr_codecs",
+]  # fmt: skip
 
 #: Variables of files whose layout is remembered: some for each file of a long archive.
 _REMEMBERED = 2**12
@@ -108,6 +111,20 @@ def read_chunk(path: Path, name: str, place: tuple[int, ...], *, zarr: bool, ope
     return _zarr_chunk(path / name, place, opened) if zarr else _hdf5_chunk(path, name, place, opened)
 
 
+def read_written_chunk(path: Path, name: str, place: tuple[int, ...], *, opened: str) -> NDArray[Any] | None:
+    """Read one chunk of an HDF5 file as it lies on disk, or return None where nothing was written, which is no damage in general.
+
+    Raises
+    ------
+    ChunkDamage, FormatError
+        As from `read_chunk`.
+    """
+    layout = _hdf5_layout(path, name, opened)
+    if place not in layout.places and not layout.damage:
+        return None
+    return _hdf5_chunk(path, name, place, opened)
+
+
 def _hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> NDArray[Any]:
     layout = _hdf5_layout(path, name, opened)
     if place not in layout.places:
@@ -167,14 +184,36 @@ def _hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
 
 def _hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
     """Filters as codecs, in the order of reading, each with its number in the pipeline."""
-    from numcodecs import Shuffle, Zlib, Zstd
+    from numcodecs import Zlib, Zstd
 
     codecs = []
     for number in reversed(range(plist.get_nfilters())):
         code, _, values, _ = plist.get_filter(number)
         made = {_DEFLATE: Zlib, _FLETCHER32: _Fletcher32, _ZSTD: Zstd}.get(code)
-        codecs.append((number, Shuffle(elementsize=values[0]) if code == _SHUFFLE else made() if made else _Unknown(code)))
+        codecs.append((number, _Shuffle(values[0]) if code == _SHUFFLE else made() if made else _Unknown(code)))
     return tuple(codecs)
+
+
+def has_known_filters(plist: Any) -> bool:
+    """Return whether all filters of an HDF5 dataset, given its creation property list, are known here."""
+    known = (_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD)
+    return all(plist.get_filter(number)[0] in known for number in range(plist.get_nfilters()))
+
+
+@dataclass(frozen=True)
+class _Shuffle:
+    """Bytes of the numbers grouped by their place; what is left at the end, as of a checksum, stays as it is."""
+
+    width: int
+
+    def decode(self, data: Any) -> Any:
+        """The bytes in the order of the numbers."""
+        from numcodecs import Shuffle
+
+        stored = np.frombuffer(data, np.uint8)
+        whole = stored.size - stored.size % max(self.width, 1)
+        ordered = Shuffle(elementsize=self.width).decode(stored[:whole])
+        return ordered if whole == stored.size else np.concatenate([np.frombuffer(ordered, np.uint8), stored[whole:]])
 
 
 class _Fletcher32:

@@ -6,7 +6,6 @@ import sys
 import threading
 import uuid
 import warnings
-from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +20,7 @@ from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.counts import from_counts
 from gyrostab.store.direct import with_fill
 from gyrostab.store.header import SMALL, Header, read_header
+from gyrostab.store.kept import KeptChunks
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.store.named import name_file
 from gyrostab.timegrid import grid_times
@@ -229,33 +229,8 @@ class _Chunks:
             _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
 
 
-class _Kept:
-    """Chunks by opening, variable and place, the latest of them, in memory that is bounded."""
-
-    def __init__(self, most: int):
-        self._most = most
-        self._held = 0
-        self._chunks: OrderedDict[tuple[Any, ...], NDArray[Any]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def find(self, key: tuple[Any, ...]) -> NDArray[Any] | None:
-        with self._lock:
-            if key in self._chunks:
-                self._chunks.move_to_end(key)
-            return self._chunks.get(key)
-
-    def keep(self, key: tuple[Any, ...], chunk: NDArray[Any]) -> None:
-        with self._lock:
-            if key in self._chunks or chunk.nbytes > self._most // 2:
-                return
-            self._chunks[key] = chunk
-            self._held += chunk.nbytes
-            while self._held > self._most:
-                self._held -= self._chunks.popitem(last=False)[1].nbytes
-
-
 #: Where one part of a run ends, another begins.
-_KEPT = _Kept(_KEPT_BYTES)
+_KEPT = KeptChunks(_KEPT_BYTES, _KEPT_BYTES // 2)
 
 _TELLING = threading.Lock()
 

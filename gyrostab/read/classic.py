@@ -1,0 +1,168 @@
+"""The header of a classic NetCDF file (CDF-1, CDF-2, CDF-5), checked against the size of the file before its library reads it.
+
+The library allocates what a damaged header asks for. Here every count is compared with the bytes that are left, so a header that
+claims too much ends in one message.
+
+References
+----------
+NetCDF classic format specification, Unidata (appendix B of the NetCDF users guide).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gyrostab.errors import FormatError
+
+__all__ = ["ClassicVariable", "read_classic_header"]
+
+#: nc_type -> numpy type, big-endian.
+_TYPES = {1: "i1", 2: "S1", 3: ">i2", 4: ">i4", 5: ">f4", 6: ">f8", 7: "u1", 8: ">u2", 9: ">u4", 10: ">i8", 11: ">u8"}
+_DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
+#: Bytes of the file that are read, more where the header is longer; the last number is room for thousands of variables.
+_HEAD_BYTES = (2**16, 2**20, 2**24)
+
+
+@dataclass(frozen=True)
+class ClassicVariable:
+    """Where the numbers of a variable lie: type, shape, byte of the first, and bytes from one place of the first dimension to the next."""
+
+    name: str
+    dtype: np.dtype[np.generic]
+    shape: tuple[int, ...]
+    begin: int
+    stride: int
+
+
+class _Header:
+    """Bytes of a header, taken from the front."""
+
+    def __init__(self, path: Path, data: bytes, wide_count: bool, wide_begin: bool):
+        self.path, self.data, self.at = path, data, 4
+        self.count_bytes, self.begin_bytes = (8 if wide else 4 for wide in (wide_count, wide_begin))
+
+    def fail(self, what: str) -> FormatError:
+        return FormatError(f"{self.path.name}: the header of this NetCDF file is damaged or cut off ({what}); copy it again")
+
+    def take(self, size: int) -> bytes:
+        if size < 0 or self.at + size > len(self.data):
+            raise self.fail(f"it claims {size:,} bytes at byte {self.at:,} of {len(self.data):,}")
+        part = self.data[self.at : self.at + size]
+        self.at += -(-size // 4) * 4
+        return part
+
+    def number(self, size: int = 4) -> int:
+        return int.from_bytes(self.take(size), "big")
+
+    def count(self) -> int:
+        return self.number(self.count_bytes)
+
+    def name(self) -> str:
+        return self.take(self.count()).decode("utf-8", "replace")
+
+    def items(self, tag: int) -> range:
+        """Return the numbers of the items of a list; each takes eight bytes at least."""
+        found, count = self.number(), self.count()
+        if (found, count) == (0, 0):
+            return range(0)
+        if found != tag or 8 * count > len(self.data) - self.at:
+            raise self.fail(f"it claims a list of {count:,} items of kind {found} at byte {self.at:,}")
+        return range(count)
+
+    def skip_attributes(self) -> None:
+        for _ in self.items(_ATTRIBUTE):
+            self.name()
+            kind, count = self.number(), self.count()
+            self.take(self.dtype(kind).itemsize * count)
+
+    def dtype(self, kind: int) -> np.dtype[np.generic]:
+        if kind not in _TYPES:
+            raise self.fail(f"there is no type {kind}")
+        return np.dtype(_TYPES[kind])
+
+
+def read_classic_header(path: Path) -> dict[str, ClassicVariable] | None:
+    """Read where the variables of a classic NetCDF file lie; None when the file is of another format.
+
+    Raises
+    ------
+    FormatError
+        When the header claims more than the file holds.
+    """
+    size = path.stat().st_size
+    for most in _HEAD_BYTES:
+        with path.open("rb") as file:
+            data = file.read(min(size, most))
+        if data[:3] != b"CDF" or data[3:4] not in (b"\1", b"\2", b"\5"):
+            return None
+        try:
+            return _read_header(_Header(path, data, data[3] == 5, data[3] in (2, 5)), size)
+        except FormatError:
+            if size <= most or most == _HEAD_BYTES[-1]:
+                raise
+    return None
+
+
+def _read_header(header: _Header, size: int) -> dict[str, ClassicVariable]:
+    records = header.count()
+    lengths = []
+    for _ in header.items(_DIMENSION):
+        header.name()
+        lengths.append(header.count())
+    header.skip_attributes()
+    found: list[tuple[str, np.dtype[np.generic], list[int], int]] = []
+    for _ in header.items(_VARIABLE):
+        name = header.name()
+        places = _take_dimensions(header, len(lengths))
+        header.skip_attributes()
+        dtype = header.dtype(header.number())
+        header.count()  # vsize, which is wrong above 4 GiB
+        found.append((name, dtype, places, header.number(header.begin_bytes)))
+    return _lay_out(header, size, records, lengths, found)
+
+
+def _take_dimensions(header: _Header, known: int) -> list[int]:
+    count = header.count()
+    if count > 1024:
+        raise header.fail(f"it claims a variable of {count:,} dimensions")
+    places = [header.count() for _ in range(count)]
+    if any(place >= known for place in places):
+        raise header.fail("a variable has a dimension that is not there")
+    return places
+
+
+def _lay_out(
+    header: _Header, size: int, records: int, lengths: list[int], found: list[tuple[str, np.dtype[np.generic], list[int], int]]
+) -> dict[str, ClassicVariable]:
+    """Find the shapes and strides, and compare the last byte of each variable with the size of the file."""
+    spans = {}
+    for name, dtype, places, _ in found:
+        shape = [lengths[place] for place in places]
+        is_record = bool(shape) and shape[0] == 0
+        spans[name] = (is_record, dtype.itemsize * _product(shape[1:] if is_record else shape))
+    rows = [span for is_record, span in spans.values() if is_record]
+    stride = rows[0] if len(rows) == 1 else sum(-(-span // 4) * 4 for span in rows)
+    variables = {}
+    begins = [begin for name, _, _, begin in found if spans[name][0]]
+    if rows and records in (2**32 - 1, 2**64 - 1):  # written as a stream: the size of the file tells
+        records = max(size - min(begins), 0) // max(stride, 1)
+    for name, dtype, places, begin in found:
+        is_record, span = spans[name]
+        shape = [lengths[place] for place in places]
+        end = begin + (stride * (records - 1) + span if is_record and records else 0 if is_record else span)
+        if end > size:
+            raise header.fail(f"{name!r} would end at byte {end:,} of {size:,}")
+        shape = [records, *shape[1:]] if is_record else shape
+        step = stride if is_record else dtype.itemsize * _product(shape[1:])
+        variables[name] = ClassicVariable(name, dtype, tuple(shape), begin, step)
+    return variables
+
+
+def _product(lengths: list[int]) -> int:
+    total = 1
+    for length in lengths:  # numbers of any size
+        total *= length
+    return total

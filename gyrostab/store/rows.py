@@ -1,0 +1,223 @@
+"""Columns of files that other programs wrote, read by ranges of rows, by several threads, without a lock or an open file.
+
+The libraries of NetCDF and HDF5 let one thread in at a time and keep chunks as long as the file is open. A column here knows
+where its numbers lie: at even distances (`EvenRows`), or in chunks (`ChunkedRows`).
+"""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.errors import DamageError
+from gyrostab.store.kept import KeptChunks
+from gyrostab.store.layout import ChunkDamage, has_known_filters, read_written_chunk
+
+__all__ = ["ChunkedRows", "EvenRows", "LibraryRows", "Rows", "hdf5_rows"]
+
+#: Bytes that are read at one time where other variables lie between the rows.
+_SPREAD_BYTES = 2**23
+#: Chunks of a variable whose places are remembered, at about 200 bytes each.
+_MOST_CHUNKS = 2**19
+#: Chunks from this size on are decoded by one thread at a time.
+_LARGE_BYTES = 2**24
+#: A part of a run has up to 2**24 samples (128 MiB) of all axes, and each of two workers may find all of them in the same chunks.
+_KEPT = KeptChunks(3 * 2**27, 2**28)
+_DECODING = threading.Lock()
+
+
+class Rows(Protocol):
+    """Stored numbers of one column."""
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return the numbers of some rows as they are stored."""
+
+
+@dataclass(frozen=True)
+class EvenRows:
+    """Numbers at even distances in a file.
+
+    Attributes
+    ----------
+    path : Path
+    dtype : dtype
+        With its byte order.
+    begin : int
+        Byte of row 0.
+    stride : int
+        Bytes from one row to the next.
+    """
+
+    path: Path
+    dtype: np.dtype[Any]
+    begin: int
+    stride: int
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return the numbers of some rows as they are stored."""
+        out = np.empty(max(stop - start, 0), self.dtype)
+        step = out.size if self.stride == self.dtype.itemsize else max(_SPREAD_BYTES // self.stride, 1)
+        with self.path.open("rb", buffering=0) as file:
+            for at in range(0, out.size, max(step, 1)):
+                part = out[at : at + step]
+                file.seek(self.begin + (start + at) * self.stride)
+                if self.stride == self.dtype.itemsize:
+                    self._fill(file, part.view(np.uint8).data)
+                    continue
+                spread = np.empty((part.size - 1) * self.stride + self.dtype.itemsize, np.uint8)
+                self._fill(file, spread.data)
+                part[:] = np.ndarray(part.shape, self.dtype, spread, 0, (self.stride,))
+        return out
+
+    def _fill(self, file: Any, view: memoryview) -> None:
+        while view.nbytes:
+            got = file.readinto(view)
+            if not got:
+                raise DamageError(f"{self.path.name}: is damaged, it is cut short; copy it again")
+            view = view[got:]
+
+
+@dataclass(frozen=True)
+class ChunkedRows:
+    """Numbers in chunks along one dimension, or one place of a second dimension.
+
+    Attributes
+    ----------
+    load : callable
+        Number of the chunk along each dimension -> chunk (or what there is of it at the end), or None where nothing was written.
+    shape, chunks : tuple of int
+        Of the variable.
+    dtype : dtype
+    fill : number
+        What is not written.
+    along, place : int
+        Dimension of the rows, and place along the other.
+    key : tuple
+        Stands for one opening of the variable.
+    """
+
+    load: Callable[[tuple[int, ...]], NDArray[Any] | None]
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fill: Any
+    along: int = 0
+    place: int = 0
+    key: tuple[Any, ...] = field(default_factory=lambda: (uuid.uuid4().hex,))
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return the numbers of some rows as they are stored."""
+        out = np.empty(max(stop - start, 0), self.dtype)
+        length = self.chunks[self.along]
+        for number in range(start // length, -(-stop // length)) if stop > start else ():
+            first = number * length
+            low, high = max(start, first), min(stop, first + length)
+            at: tuple[int, ...] = (number,)
+            inside: Any = slice(low - first, high - first)
+            if len(self.shape) == 2:
+                across, rest = divmod(self.place, self.chunks[1 - self.along])
+                at, inside = ((number, across), (inside, rest)) if self.along == 0 else ((across, number), (rest, inside))
+            alone = len(self.shape) == 1 or self.chunks[1 - self.along] == 1
+            chunk = self._chunk(at, kept=not alone or low > first or high < min(first + length, self.shape[self.along]))
+            out[low - start : high - start] = self.fill if chunk is None else chunk[inside]
+        return out
+
+    def _chunk(self, at: tuple[int, ...], *, kept: bool) -> NDArray[Any] | None:
+        """Return a chunk; one that will be wanted again is kept."""
+        chunk = _KEPT.find((*self.key, at))
+        if chunk is not None:
+            return chunk
+        if np.prod(self.chunks) * self.dtype.itemsize >= _LARGE_BYTES:
+            with _DECODING:
+                chunk = _KEPT.find((*self.key, at))
+                return self._load(at, kept=kept) if chunk is None else chunk
+        return self._load(at, kept=kept)
+
+    def _load(self, at: tuple[int, ...], *, kept: bool) -> NDArray[Any] | None:
+        chunk = self.load(at)
+        if kept and chunk is not None:
+            _KEPT.keep((*self.key, at), chunk)
+        return chunk
+
+
+@dataclass(frozen=True)
+class LibraryRows:
+    """Numbers that only a library knows how to read, while the file is open.
+
+    Attributes
+    ----------
+    variable : Any
+        Gives stored numbers when indexed.
+    along, place : int
+        Dimension of the rows, and place along the other.
+    """
+
+    variable: Any
+    along: int = 0
+    place: int = 0
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return the numbers of some rows as they are stored."""
+        if len(self.variable.shape) == 1:
+            return np.asarray(self.variable[start:stop])
+        return np.asarray(self.variable[start:stop, self.place] if self.along == 0 else self.variable[self.place, start:stop])
+
+
+def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
+    """Find out how the rows of an HDF5 dataset are read without the library.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    variable : h5py.Dataset
+        Of one or two dimensions.
+
+    Returns
+    -------
+    callable or None
+        Dimension of the rows and place along the other -> column; None where only the library knows how to read it.
+    """
+    import h5py
+
+    plist = variable.id.get_create_plist()
+    shape, dtype = variable.shape, variable.dtype
+    if plist.get_layout() == h5py.h5d.CONTIGUOUS and not plist.get_external_count() and variable.id.get_offset() is not None:
+        return partial(_even_rows, path.absolute(), dtype, variable.id.get_offset(), shape)
+    if plist.get_layout() != h5py.h5d.CHUNKED or not has_known_filters(plist):
+        return None
+    if np.prod([-(-size // length) for size, length in zip(shape, variable.chunks, strict=True)], dtype=float) > _MOST_CHUNKS:
+        return None  # a table of their places would be larger than the chunks
+    key = (uuid.uuid4().hex, variable.name)
+    load = partial(_load_hdf5, path.absolute(), variable.name, variable.chunks, key[0])
+    return lambda along, place: ChunkedRows(load, shape, variable.chunks, dtype, variable.fillvalue, along, place, key)
+
+
+def _even_rows(path: Path, dtype: np.dtype[Any], begin: int, shape: tuple[int, ...], along: int, place: int) -> EvenRows:
+    wide = dtype.itemsize
+    if len(shape) == 1:
+        return EvenRows(path, dtype, begin, wide)
+    if along == 0:
+        return EvenRows(path, dtype, begin + place * wide, shape[1] * wide)
+    return EvenRows(path, dtype, begin + place * shape[1] * wide, wide)
+
+
+def _load_hdf5(path: Path, name: str, chunks: tuple[int, ...], opened: str, at: tuple[int, ...]) -> NDArray[Any] | None:
+    try:
+        chunk = read_written_chunk(path, name, at, opened=opened)
+    except ChunkDamage as damage:
+        raise DamageError(f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {damage}; copy it again") from damage
+    if chunk is None:
+        return None
+    if chunk.size != int(np.prod(chunks)):
+        what = f"holds {chunk.size} values in place of {int(np.prod(chunks))}"
+        raise DamageError(f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {what}; copy it again")
+    return chunk.reshape(chunks)
