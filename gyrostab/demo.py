@@ -150,32 +150,27 @@ def run_demo(folder: str | Path, *, overwrite: bool = False, stage: Stage = no_s
     from gyrostab.davar import davar
     from gyrostab.export import to_netcdf
     from gyrostab.fit import fit_noise
+    from gyrostab.output import check_folder, new_folder, protect_inputs
     from gyrostab.report import write_report
 
-    files = _prepare(Path(folder), overwrite=overwrite)
-    stage("reading", 0)
-    log = load_log([sample_log()])
-    parts = find_parts(log["vibration"])
-    to_netcdf(log, files["log.nc"], overwrite=overwrite)
-    stage("computing", samples_of(log))
-    product = fit_noise(davar(log, window=WINDOW, step=STEP)).compute()
-    to_netcdf(product, files["product.nc"], overwrite=overwrite)
-    stage("drawing", 0)
-    _draw(log, product, files, overwrite=overwrite)
-    write_report(product, files["report.html"], log=log, overwrite=overwrite)
-    return summarise(product, parts), list(files.values())
+    folder = Path(folder)
+    with protect_inputs([sample_log()]):
+        check_folder(folder, FILES, overwrite=overwrite)
+        with new_folder(folder, overwrite=overwrite) as temporary:
+            stage("reading", 0)
+            log = load_log([sample_log()])
+            parts = find_parts(log["vibration"])
+            to_netcdf(log, temporary / "log.nc")
+            stage("computing", samples_of(log))
+            product = fit_noise(davar(log, window=WINDOW, step=STEP)).compute()
+            to_netcdf(product, temporary / "product.nc")
+            stage("drawing", 0)
+            _draw(log, product, temporary)
+            write_report(product, temporary / "report.html", log=log)
+    return summarise(product, parts), [folder / name for name in FILES]
 
 
-def _prepare(folder: Path, *, overwrite: bool) -> dict[str, Path]:
-    from gyrostab.output import make_folder
-    from gyrostab.run import check_output
-
-    make_folder(folder)
-    return {name: check_output(folder / name, overwrite=overwrite) for name in FILES}
-
-
-def _draw(log: xr.Dataset, product: xr.Dataset, files: dict[str, Path], *, overwrite: bool) -> None:
-    from gyrostab.output import new_output
+def _draw(log: xr.Dataset, product: xr.Dataset, folder: Path) -> None:
     from gyrostab.plot import plot_coefficients, plot_davar, plot_davar_3d, plot_signal
     from gyrostab.plot.style import save_png
 
@@ -187,5 +182,4 @@ def _draw(log: xr.Dataset, product: xr.Dataset, files: dict[str, Path], *, overw
         "coefficients.png": plot_coefficients(product),
     }
     for name, figure in figures.items():
-        with new_output(files[name], overwrite=overwrite) as temporary:
-            save_png(figure, temporary, dpi=120)
+        save_png(figure, folder / name, dpi=120)

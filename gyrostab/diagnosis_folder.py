@@ -10,12 +10,13 @@ from pathlib import Path
 import xarray as xr
 
 from gyrostab.diagnose.conclusion.result import Diagnosis, check_diagnosis, model_text
-from gyrostab.errors import FormatError, OutputError, SchemaError
+from gyrostab.errors import FormatError, SchemaError
 from gyrostab.export import open_dataset, to_netcdf
 from gyrostab.output import new_output
+from gyrostab.output.content import read_json
 from gyrostab.report import write_diagnosis_report
 
-__all__ = ["FILES", "check_folder", "open_diagnosis", "write_diagnosis"]
+__all__ = ["FILES", "find_foreign_file", "open_diagnosis", "write_diagnosis"]
 
 #: Files of the folder.
 FILES = ("diagnosis.json", "model.toml", "diagnosis.nc", "report.html")
@@ -43,12 +44,11 @@ def write_diagnosis(diagnosis: Diagnosis, directory: str | os.PathLike[str], *, 
     SchemaError
         When the content is not that of a diagnosis.
     OutputError
-        When the folder exists, or cannot be written.
+        When the folder exists, holds something else, or cannot be written.
     """
     check_diagnosis(diagnosis.content)
     directory = Path(directory)
-    check_folder(directory, overwrite=overwrite)
-    with new_output(directory, overwrite=overwrite, directory=True) as temporary:
+    with new_output(directory, overwrite=overwrite, find_foreign=find_foreign_file) as temporary:
         (temporary / "diagnosis.json").write_text(diagnosis.to_json(), encoding="utf-8")
         (temporary / "model.toml").write_text(model_text(diagnosis.model, heading=_heading(diagnosis)), encoding="utf-8")
         to_netcdf(diagnosis.surfaces, temporary / "diagnosis.nc")
@@ -56,19 +56,21 @@ def write_diagnosis(diagnosis: Diagnosis, directory: str | os.PathLike[str], *, 
     return [directory / name for name in FILES]
 
 
-def check_folder(directory: Path, *, overwrite: bool) -> None:
-    """Raise `OutputError` before the long work when the folder cannot be made, or holds something else that would be lost."""
-    if not directory.parent.is_dir():
-        raise OutputError(f"output {str(directory)!r}: there is no directory {str(directory.parent)!r}; make it first or choose another")
-    if directory.exists() and not directory.is_dir():
-        raise OutputError(f"output {str(directory)!r} is a file; give the name of a folder with -o")
-    if not directory.exists():
-        return
-    if not overwrite:
-        raise OutputError(f"output {str(directory)!r} exists already; give --overwrite to replace it, or another name with -o")
-    others = sorted(item.name for item in directory.iterdir() if item.name not in FILES)
-    if others:
-        raise OutputError(f"output {str(directory)!r} holds {others[0]!r} too, which would be lost; give another name with -o")
+def find_foreign_file(directory: Path) -> str | None:
+    """Find an item in a folder that is not part of a diagnosis; None for the folder of a diagnosis, and for an empty one."""
+    names = sorted(item.name for item in directory.iterdir())
+    ours = is_diagnosis(directory)
+    return next((name for name in names if not ours or name not in FILES or not _is_plain_file(directory / name)), None)
+
+
+def is_diagnosis(directory: Path) -> bool:
+    """Whether a folder holds a diagnosis of any version."""
+    content = read_json(directory / "diagnosis.json")
+    return isinstance(content, dict) and str(content.get("schema")).startswith("gyrostab.diagnosis/")
+
+
+def _is_plain_file(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
 
 
 def _heading(diagnosis: Diagnosis) -> str:

@@ -18,7 +18,7 @@ import xarray as xr
 
 from gyrostab.cf import from_disk, index_dim, to_disk
 from gyrostab.errors import FormatError, OptionError, SchemaError, reading_of
-from gyrostab.output import new_output
+from gyrostab.output import find_foreign_item, find_sources, new_output
 from gyrostab.schema import check_log, check_product, check_surface
 from gyrostab.store import (
     Misfit,
@@ -61,7 +61,7 @@ def to_netcdf(
     path : path-like
         The file to make. It takes this name only once it is complete.
     overwrite : bool
-        Replace an existing file.
+        Replace an existing file, unless the dataset is lazy and still reads from it.
     compression : {"zstd", "zlib"}, optional
         zstd is two to four times as fast, zlib is read by every NetCDF program. By default zstd for a log, zlib for everything else.
     progress : callable, optional
@@ -75,7 +75,7 @@ def to_netcdf(
     Raises
     ------
     OptionError
-        When there is no such compression.
+        When there is no such compression, or when the dataset reads from the file.
     OutputError
         When the file exists, or cannot be written; nothing half-written is left behind.
 
@@ -93,6 +93,7 @@ def to_netcdf(
     np.datetime64('1970-01-01T00:00:00.003333333')
     """
     stored = to_disk(dataset, "to_netcdf")
+    sources = find_sources(dataset)
     filters = _filters(compression, log=_rate(stored) is not None)
 
     def write(packed: xr.Dataset) -> None:
@@ -100,7 +101,7 @@ def to_netcdf(
         encoding = _netcdf_encoding(packed, filters)
         long = long_variables(packed) if log else large_variables(packed, encoding)
         rest = {name: options for name, options in encoding.items() if name not in long}
-        with new_output(path, overwrite=overwrite) as temporary:
+        with new_output(path, overwrite=overwrite, inputs=sources) as temporary:
             _begin_netcdf(packed.drop_vars(long), temporary, rest)
             (append_netcdf if log else append_deflated)(temporary, long, encoding, progress=progress)
 
@@ -160,7 +161,7 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
     path : path-like
         The directory to make.
     overwrite : bool
-        Replace an existing store.
+        Replace an existing store, unless other files are in it, or the dataset is lazy and still reads from it.
     progress : callable, optional
         Told the share of the long variables that is written.
 
@@ -172,7 +173,9 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
     Raises
     ------
     OutputError
-        When it exists, or cannot be written.
+        When it exists, holds what belongs to no Zarr store, or cannot be written.
+    OptionError
+        When the dataset reads from it.
 
     Examples
     --------
@@ -183,6 +186,7 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
     ('axis', 'tau', 'time')
     """
     stored = to_disk(dataset, "to_zarr")
+    sources = find_sources(dataset)
 
     def write(packed: xr.Dataset) -> None:
         long = long_variables(packed) if _rate(packed) is not None else {}
@@ -190,7 +194,7 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
         rest = {name: options for name, options in encoding.items() if name not in long}
         lazy = {name: packed[name].variable for name in rest if packed[name].chunks is not None and "chunks" in encoding[name]}
         aligned = {name: v.chunk(dict(zip(v.dims, encoding[name]["chunks"], strict=True))) for name, v in lazy.items()}
-        with new_output(path, overwrite=overwrite, directory=True) as temporary:
+        with new_output(path, overwrite=overwrite, find_foreign=find_foreign_item, inputs=sources) as temporary:
             whole = packed.drop_vars(long).assign(aligned)
             whole.to_zarr(temporary, mode="w", zarr_format=2, consolidated=not long, encoding=rest, write_empty_chunks=True)
             append_zarr(temporary, long, encoding, progress=progress)

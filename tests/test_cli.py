@@ -196,7 +196,7 @@ def test_cycles_are_looked_for_seldom_and_afterwards_as_before(monkeypatch):
     before, found = gc.get_threshold(), []
 
     class Failing(list):
-        def __call__(self, *arguments, **options) -> None:
+        def parse_args(self, *arguments, **options) -> None:
             found.append(gc.get_threshold())
             raise RuntimeError("no")
 

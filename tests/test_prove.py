@@ -168,7 +168,7 @@ def test_a_stopped_run_goes_on_and_comes_to_what_an_unbroken_one_does(finished, 
     assert len(list((folder / "diagnoses").iterdir())) == 1
     assert not (folder / "scores.csv").exists()
     sums = (folder / "SHA256SUMS").read_bytes()
-    leftover = folder / "diagnoses" / ".abc.json.12345678.part"
+    leftover = folder / "diagnoses" / ".abc.json.gyrostab-12345678.part"
     leftover.write_text("half")
 
     later = []

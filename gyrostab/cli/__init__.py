@@ -12,7 +12,8 @@ from collections.abc import Sequence
 
 from gyrostab.cli import commands
 from gyrostab.cli.console import complain, explain, plain_notes, read_config, seldom_collected, stoppable
-from gyrostab.cli.frame import app
+from gyrostab.cli.frame import app, find_inputs
+from gyrostab.output import protect_inputs
 
 __all__ = ["app", "main"]
 
@@ -43,7 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         app.config = read_config(tokens, [command for command in app if not command.startswith("-")])
         with plain_notes(), stoppable(), seldom_collected():
-            app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+            command, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
+            with protect_inputs(find_inputs(bound.arguments)):
+                command(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as stop:
         said = str(stop) or "interrupted; nothing was written under the name of the output. Start the same command again."
         return complain(said, 3)

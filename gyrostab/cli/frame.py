@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,7 @@ from cyclopts import App, Parameter
 
 from gyrostab.cli.options import Common
 
-__all__ = ["Logs", "Output", "Product", "app", "work"]
+__all__ = ["Logs", "Output", "Product", "app", "find_inputs", "work"]
 
 Logs = Annotated[list[Path], Parameter(name="LOG...", negative=())]
 Product = Annotated[Path, Parameter(name="PRODUCT")]
@@ -37,3 +38,21 @@ def work(common: Common) -> Iterator[Any]:
     chosen = {"num_workers": common.workers} if common.workers else {}
     with dask.config.set(scheduler="threads", **chosen), show_progress(quiet=common.quiet_progress) as stage:
         yield stage
+
+
+def find_inputs(arguments: Mapping[str, Any]) -> list[Path]:
+    """Find the files that a command reads: every path among its arguments but the output, and every TOML file of an option.
+
+    Examples
+    --------
+    >>> find_inputs({"logs": [Path("run7.csv")], "output": Path("run7.nc"), "map": ["wx=gyro_x", "names.toml"]})
+    [PosixPath('run7.csv'), PosixPath('names.toml')]
+    """
+    found: list[Path] = []
+    for value in (value for name, value in arguments.items() if name != "output"):
+        if is_dataclass(value) and not isinstance(value, type):
+            found += find_inputs(asdict(value))
+        for item in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(item, Path) or (isinstance(item, str) and item.lower().endswith(".toml")):
+                found.append(Path(item))
+    return found

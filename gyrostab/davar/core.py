@@ -24,6 +24,7 @@ from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_th
 from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, avar_columns, sample_squares
+from gyrostab.output import pass_sources
 from gyrostab.schema import attributes
 from gyrostab.store.direct import can_fill, fill_row, stretch
 from gyrostab.timegrid import first_stamp, grid_times
@@ -310,6 +311,8 @@ def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
         rows_cells.append(da.concatenate(cells, axis=1))
         rows_means.append(da.concatenate(means, axis=1))
     stacked = da.stack(rows_cells, axis=1), da.stack(rows_means, axis=1)
+    if lazy:
+        pass_sources(data, *stacked)
     return stacked if lazy else dask.compute(*stacked)
 
 

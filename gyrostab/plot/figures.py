@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import xarray as xr
 
 from gyrostab.correlate import correlate
-from gyrostab.errors import OutputError
-from gyrostab.output import make_folder, new_output
+from gyrostab.output import check_folder, new_folder
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
 from gyrostab.plot.correlation import plot_correlation
@@ -85,14 +84,12 @@ def save_figures(product: xr.Dataset, folder: str | os.PathLike[str], *, dpi: in
     SchemaError
         When it is no product.
     OutputError
-        When a figure exists and `overwrite` is not given (none is written then), or when the folder cannot be written to.
+        When a figure exists and `overwrite` is not given, or when the folder cannot be written to; none is written then.
     """
     folder = Path(folder)
-    figures = {folder / (re.sub(r"[^\w.-]", "_", name) + ".png"): draw for name, draw in product_figures(product).items()}
-    make_folder(folder)
-    if not overwrite and (there := [path.name for path in figures if path.exists()]):
-        raise OutputError(f"{folder} holds {', '.join(there)} already; give --overwrite to replace them, or another folder with -o")
-    for path, draw in figures.items():
-        with new_output(path, overwrite=overwrite) as temporary:
-            save_png(draw(), temporary, dpi=dpi)
-    return list(figures)
+    figures = {re.sub(r"[^\w.-]", "_", name) + ".png": draw for name, draw in product_figures(product).items()}
+    check_folder(folder, figures, overwrite=overwrite)
+    with new_folder(folder, overwrite=overwrite) as temporary:
+        for name, draw in figures.items():
+            save_png(draw(), temporary / name, dpi=dpi)
+    return [folder / name for name in figures]

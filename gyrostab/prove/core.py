@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gyrostab.errors import ResumeError
+from gyrostab.output import resolve_link
 from gyrostab.prove.folder import TUNING, begin, case_name, look, read_sums, write_sums
 from gyrostab.prove.pool import each_in_processes
 from gyrostab.prove.steps import compare_case, diagnose_case, draw_case
@@ -107,7 +108,7 @@ def prove(
     from gyrostab.progress import no_stage
     from gyrostab.run.job import hold
 
-    folder, stage, tell = Path(directory), progress or no_stage, say or (lambda text: None)
+    folder, stage, tell = resolve_link(directory), progress or no_stage, say or (lambda text: None)
     salted = 0 if real is None else (cases or _USUAL["cases"]) // _SALTED
     fresh = {**_USUAL, "seed": TUNING + secrets.randbelow(10**9), "salted": salted}
     wanted = {"cases": cases, "seed": seed, "nulls": nulls}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import re
 import shutil
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -16,7 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
-from gyrostab.output import new_output
+from gyrostab.output import is_leftover, replace_file
+from gyrostab.output.check import check_target
+from gyrostab.output.content import read_json
+from gyrostab.run.job import is_lock
 
 __all__ = ["TUNING", "asked", "begin", "case_name", "code_state", "look", "read_sums", "write_json", "write_sums", "write_text"]
 
@@ -26,12 +30,13 @@ TUNING = 1_000_000
 _SCHEMA = "gyrostab.prove/2"
 _SUMS = "SHA256SUMS"
 _FOLDERS = ("recordings", "truth", "diagnoses", "comparisons", "failed")
+_CASE_FILE = re.compile(r"[0-9a-f]{12}\.(nc|json|txt)")
 _FILES = ("benchmark.json", _SUMS, "scores.csv", "table.md", "completeness.png", "reliability.png", "lock")
 
 
 def write_text(path: Path, text: str) -> Path:
     """Write a file that has its name only once it is complete."""
-    with new_output(path, overwrite=True) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 
@@ -80,8 +85,8 @@ def look(
     directory: Path, wanted: Mapping[str, int | None], usual: Mapping[str, int], *, resume: bool, overwrite: bool
 ) -> tuple[dict[str, Any] | None, dict[str, int]]:
     """What was begun in a folder and is to go on, or None, and what is to be done; see `begin`. Changes nothing."""
-    _check_place(directory)
     before = asked(directory) if directory.is_dir() and (resume or not overwrite) else None
+    check_target(directory, overwrite=True, find_foreign=find_foreign_file if before is None else lambda _: None)
     if before is None:
         chosen = dict(usual) | {name: value for name, value in wanted.items() if value is not None}
         _check_wishes(chosen)
@@ -127,7 +132,8 @@ def begin(directory: Path, wanted: Mapping[str, int | None], usual: Mapping[str,
     state = code_state()
     if before is not None:
         for left in (*directory.glob(".*.part"), *directory.glob("*/.*.part")):  # of a run that was killed
-            _remove(left)
+            if is_leftover(left.name):
+                _remove(left)
         if state != before["code"][-1]:
             before["code"].append(state)
             write_json(directory / "benchmark.json", before)
@@ -165,20 +171,30 @@ def _check_wishes(chosen: Mapping[str, int]) -> None:
         raise OptionError(f"nulls={chosen['nulls']}: a diagnosis needs 100 null records at least; give 400, or 200 for a quick look")
 
 
-def _check_place(directory: Path) -> None:
-    if not directory.parent.is_dir():
-        raise OutputError(f"output {str(directory)!r}: there is no directory {str(directory.parent)!r}; make it first or choose another")
-    if directory.exists() and not directory.is_dir():
-        raise OutputError(f"output {str(directory)!r} is a file; give the name of a folder with -o")
-
-
 def _check_content(directory: Path, *, overwrite: bool) -> None:
-    found = sorted(item.name for item in directory.iterdir() if item.name != "lock") if directory.is_dir() else []
-    others = [name for name in found if name not in (*_FILES, *_FOLDERS) and not name.endswith(".part")]
-    if others:
-        raise OutputError(f"output {str(directory)!r} holds {others[0]!r}; give the name of a folder of its own with -o")
+    found = [item.name for item in directory.iterdir() if item.name != "lock"] if directory.is_dir() else []
     if found and not overwrite:
         raise OutputError(f"output {str(directory)!r} is not empty; give --overwrite to replace what is in it, or another name with -o")
+
+
+def find_foreign_file(directory: Path) -> str | None:
+    """Find an item in a folder that is not part of a benchmark; None for the folder of a benchmark, and for one without files."""
+    content = read_json(directory / "benchmark.json")
+    ours = isinstance(content, dict) and str(content.get("schema")).startswith("gyrostab.prove/")
+    for path in sorted(directory.rglob("*")):
+        place = path.relative_to(directory)
+        if path.is_symlink() or not (path.is_file() or place.as_posix() in _FOLDERS):
+            return str(place)
+        known = is_lock(path) if str(place) == "lock" else ours and _is_of_benchmark(place)
+        if path.is_file() and not known:
+            return str(place)
+    return None
+
+
+def _is_of_benchmark(place: Path) -> bool:
+    if is_leftover(place.name):
+        return True
+    return place.name in _FILES if len(place.parts) == 1 else _CASE_FILE.fullmatch(place.name) is not None
 
 
 def write_sums(directory: Path, sums: Mapping[str, str]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from gyrostab.concealed import by_effect, curves, markdown, missed, reliability, salt_differences, salt_table, score_case
-from gyrostab.output import new_output
+from gyrostab.output import replace_file
 from gyrostab.prove.figures import draw_completeness, draw_reliability
 from gyrostab.prove.folder import TUNING, write_text
 
@@ -43,7 +43,7 @@ def write_outcome(
     write_text(targets[0], pd.DataFrame(plain).to_csv(index=False))
     write_text(targets[1], page_text(rows, table, job=job, sealed=sealed, failed=failed))
     for target, draw in zip(targets[2:], (draw_completeness(curves(rows)), draw_reliability(reliability(rows))), strict=True):
-        with new_output(target, overwrite=True) as temporary:
+        with replace_file(target) as temporary:
             draw(temporary)
     return targets
 

@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.export import CHUNK_VALUES
-from gyrostab.output import new_output
+from gyrostab.output import replace_file
 from gyrostab.parts import with_part
 
 __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
@@ -93,7 +93,7 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     text = json.dumps(header).encode()
     head = (_MAGIC + len(text).to_bytes(8, "little") + text).ljust(_begin(len(text)), b"\0")
     path = block_path(folder, part)
-    with new_output(path, overwrite=True) as temporary, temporary.open("wb", buffering=0) as file:
+    with replace_file(path) as temporary, temporary.open("wb", buffering=0) as file:
         digest = hashlib.sha256()
         for piece in (head, *(piece for values in arrays.values() for piece in (values, bytes(-values.nbytes % _ALIGN)))):
             view = memoryview(piece) if isinstance(piece, bytes) else piece.reshape(-1).view(np.uint8).data

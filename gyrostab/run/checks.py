@@ -3,65 +3,11 @@
 from __future__ import annotations
 
 import math
-import tempfile
-from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
-from gyrostab.errors import OptionError, OutputError
+from gyrostab.errors import OptionError
 
-__all__ = ["check_output", "check_windows"]
-
-
-def check_output(path: str | Path, *, suffixes: Sequence[str] = (), overwrite: bool = False, inputs: Iterable[str | Path] = ()) -> Path:
-    """Make sure, before the long work starts, that a result can be written.
-
-    Parameters
-    ----------
-    path : str or Path
-        File (or Zarr folder) to be written.
-    suffixes : sequence of str
-        Endings that the stage can write, with the dot; empty for any.
-    overwrite : bool
-        Whether an existing output may be replaced.
-    inputs : iterable of path
-        Files that are read, which the output must not replace.
-
-    Returns
-    -------
-    Path
-        The path.
-
-    Raises
-    ------
-    OptionError
-        When the name has the wrong ending, or is an input.
-    OutputError
-        When the output exists and `overwrite` is not given, or its folder cannot be written to.
-
-    Examples
-    --------
-    >>> check_output("product.txt", suffixes=[".nc"])
-    Traceback (most recent call last):
-    gyrostab.errors.OptionError: output 'product.txt' must end in .nc; give another name with -o
-    """
-    path = Path(path)
-    if suffixes and path.suffix.lower() not in suffixes:
-        raise OptionError(f"output {str(path)!r} must end in {' or '.join(suffixes)}; give another name with -o")
-    if any(Path(item).resolve() == path.resolve() for item in inputs):
-        raise OptionError(f"output {str(path)!r} is also an input and would be destroyed; give another name with -o")
-    if path.is_dir() and path.suffix.lower() != ".zarr":
-        raise OutputError(f"output {str(path)!r} is a directory; give another name with -o")
-    if path.is_file() and path.suffix.lower() == ".zarr":
-        raise OutputError(f"output {str(path)!r} is a file, and Zarr needs a directory; give another name with -o")
-    if path.exists() and not overwrite:
-        raise OutputError(f"output {str(path)!r} exists already; give --overwrite to replace it, or another name with -o")
-    try:
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise OutputError(f"output {str(path)!r}: nothing can be written in {str(path.parent)!r} ({error.strerror})") from error
-    return path
+__all__ = ["check_windows"]
 
 
 def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau_max: str | None = None, **other: Any) -> None:

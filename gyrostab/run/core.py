@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,12 +15,14 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
 from gyrostab.kernels.workspace import Workspaces
+from gyrostab.output import check_output, protect_inputs, remove_leftovers, resolve_link
 from gyrostab.progress import Stage, no_stage
 from gyrostab.run.checkpoint import find_blocks
-from gyrostab.run.checks import check_output, check_windows
+from gyrostab.run.checks import check_windows
 from gyrostab.run.engine import Blocks, compute_blocks, compute_part, share_constant, write_blocks
 from gyrostab.run.job import (
     begin_job,
+    check_job_folder,
     clear_job,
     describe_inputs,
     differences,
@@ -30,8 +33,9 @@ from gyrostab.run.job import (
     kept_parts,
     make_fingerprint,
     read_job,
+    remove_damage,
     remove_job,
-    remove_leftovers,
+    seal_store,
 )
 from gyrostab.run.schedule import Pool, check_scheduler, open_pool
 
@@ -142,32 +146,16 @@ def run(
         When interrupted; its message says how much is done.
     """
     scheduler = check_scheduler(scheduler)
-    target = check_output(output, suffixes=[".nc"], overwrite=True, inputs=paths)
     fitting = None if surface_only else dict(fitting or {})
     options: dict[str, Any] = {"reading": dict(reading or {}), "windows": dict(windows or {}), "fitting": fitting}
     check_windows(**options["windows"])
-    job = _describe(paths, target, options)
-    blocks: Blocks = {}
-    with hold(job.folder):
-        try:
-            begun = _look(job, resume=resume, overwrite=overwrite)
-            if begun.complete:
-                warnings.warn(f"{target} is complete already", stacklevel=2)
-            else:
-                with open_pool(scheduler, workers=workers, files=job.files) as pool:
-                    _compute(job, blocks, paths, begun=begun, pool=pool, stage=stage)
-                _write(job, blocks, overwrite=begun.overwrite, stage=stage)
-        except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(_kept(job, "interrupted")) from stop
-        except GyrostabError as error:
-            if is_begun(job.folder) and not isinstance(error, ResumeError):
-                raise type(error)(_kept(job, str(error))) from error
-            raise
-        finally:
-            if not is_begun(job.folder):
-                remove_job(job.folder, output=target)
-        remove_job(job.folder, output=target)
-    return target
+    with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
+        check_output(output, suffixes=[".nc"], overwrite=True)
+        job = _describe(paths, resolve_link(output), options)
+        check_job_folder(job.folder)
+        pool = partial(open_pool, scheduler, workers=workers, files=job.files)
+        _run_job(job, paths, pool, resume=resume, overwrite=overwrite, stage=stage)
+    return Path(output)
 
 
 class _Job(NamedTuple):
@@ -187,6 +175,38 @@ class _Begun(NamedTuple):
     complete: bool
     fresh: bool
     overwrite: bool
+
+
+def _run_job(
+    job: _Job,
+    paths: Sequence[str | Path],
+    open_workers: Callable[[], AbstractContextManager[Pool]],
+    *,
+    resume: bool,
+    overwrite: bool,
+    stage: Stage,
+) -> None:
+    """Do what is missing of a job, as the only process that works on it."""
+    blocks: Blocks = {}
+    with hold(job.folder):
+        try:
+            begun = _look(job, resume=resume, overwrite=overwrite)
+            if begun.complete:
+                warnings.warn(f"{job.target} is complete already", stacklevel=2)
+            else:
+                with open_workers() as pool:
+                    _compute(job, blocks, paths, begun=begun, pool=pool, stage=stage)
+                _write(job, blocks, overwrite=begun.overwrite, stage=stage)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(_kept(job, "interrupted")) from stop
+        except GyrostabError as error:
+            if is_begun(job.folder) and not isinstance(error, ResumeError):
+                raise type(error)(_kept(job, str(error))) from error
+            raise
+        finally:
+            if not is_begun(job.folder):
+                remove_job(job.folder, output=job.target)
+        remove_job(job.folder, output=job.target)
 
 
 def _describe(paths: Sequence[str | Path], target: Path, options: dict[str, Any]) -> _Job:
@@ -265,6 +285,7 @@ def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _
     store = job.folder / "log.zarr"
     if begun.fresh:
         clear_job(job.folder)
+    remove_damage(job.folder)
     remove_leftovers(job.target)
     stage("reading", 0)
     on_file = partial(_say_file, stage)
@@ -284,6 +305,7 @@ def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _
         if not store.exists() and not any(map(_is_log, job.files)):  # some may be damaged; the two kinds do not mix
             stage("storing", 0)
             to_zarr(log, store)
+            seal_store(job.folder)
         if store.exists():
             source = {"paths": _absolute([store])}
         call = (_part_of_files, pool.share(json.dumps(source, default=str)), windows, fitting)

@@ -7,11 +7,11 @@
 from __future__ import annotations
 
 import contextlib
-import glob
 import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,11 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from gyrostab.errors import ResumeError
-from gyrostab.output import new_output
+from gyrostab.errors import OutputError, ResumeError
+from gyrostab.output import describe_file, is_leftover, remove_leftovers, replace_file
+from gyrostab.output.content import read_json
 
 __all__ = [
     "begin_job",
+    "check_job_folder",
     "clear_job",
     "describe_inputs",
     "differences",
@@ -35,14 +37,18 @@ __all__ = [
     "folder_of",
     "hold",
     "is_begun",
+    "is_lock",
     "kept_parts",
     "make_fingerprint",
     "read_job",
+    "remove_damage",
     "remove_job",
-    "remove_leftovers",
+    "seal_store",
 ]
 
 _SCHEMA = "gyrostab.job/1"
+_JOB_FILE = re.compile(r"lock|job\.json|log\.zarr|log\.sha256|windows-\d{10}\.block")
+_STORE_SUM = "log.sha256"
 _SAID = 4  # differences that a message lists
 
 
@@ -51,36 +57,51 @@ def folder_of(output: Path) -> Path:
     return output.with_name(f".{output.name}.job")
 
 
+def check_job_folder(folder: Path) -> None:
+    """Raise `OutputError` when something has the name of a job folder that no run has made; it would be written into and removed.
+
+    Files of a run have fixed names, and ``lock`` or ``job.json`` says what they are.
+    """
+    if not os.path.lexists(folder):
+        return
+    names = _names(folder) if folder.is_dir() and not folder.is_symlink() else [""]
+    foreign = [name for name in names if not (_JOB_FILE.fullmatch(name) or is_leftover(name))]
+    if not foreign and names and not any(_is_marked(folder / name) for name in names):
+        foreign = names
+    if foreign:
+        raise OutputError(
+            f"{folder / min(foreign)}: the run keeps its finished parts under this name, and gyrostab did not make what is there; "
+            "move it, or give the output another name with -o"
+        )
+
+
+def _is_marked(path: Path) -> bool:
+    """Whether a file of a job folder says that a run has made it."""
+    if path.name == "lock":
+        return is_lock(path)
+    if path.name == "job.json":
+        content = read_json(path)
+        return isinstance(content, dict) and str(content.get("schema")).startswith("gyrostab.job/")
+    return False
+
+
+def is_lock(path: Path) -> bool:
+    """Whether a file is a lock that `hold` has made."""
+    start = _read_start(path, 8)
+    return start is not None and b"process ".startswith(start)
+
+
+def _read_start(path: Path, count: int) -> bytes | None:
+    """First bytes of a regular file; None of anything else."""
+    if not path.is_file() or path.is_symlink():
+        return None
+    with path.open("rb") as file:
+        return file.read(count)
+
+
 def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
     """Path, size [bytes] and time of change of each input; of a directory (Zarr) those of all its files together."""
-    return [{"path": os.path.abspath(path), **_described(path)} for path in paths]
-
-
-def _described(path: Path) -> dict[str, Any]:
-    try:
-        if not path.is_dir():
-            found = path.stat()
-            return {"bytes": found.st_size, "changed_ns": found.st_mtime_ns}
-        listing = sorted(_files_below(str(path), ""))
-    except OSError:
-        return {"bytes": None, "changed_ns": None}
-    return {
-        "bytes": sum(size for _, size, _ in listing),
-        "changed_ns": max((changed for *_, changed in listing), default=0),
-        "files": len(listing),
-        "listing": hashlib.sha256(json.dumps(listing).encode()).hexdigest(),
-    }
-
-
-def _files_below(folder: str, inside: str) -> Iterator[tuple[str, int, int]]:
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            name = f"{inside}{entry.name}"
-            if entry.is_dir():
-                yield from _files_below(entry.path, f"{name}/")
-            else:
-                found = entry.stat()
-                yield name, found.st_size, found.st_mtime_ns
+    return [{"path": os.path.abspath(path), **describe_file(path)} for path in paths]
 
 
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:
@@ -210,19 +231,59 @@ def _lock(handle: int, folder: Path) -> None:
 
 
 def read_job(folder: Path) -> dict[str, Any] | None:
-    """What a begun run was asked for; None when none was begun."""
-    try:
-        job: dict[str, Any] = json.loads((folder / "job.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    """What a begun run was asked for; None when none was begun, or when the file is damaged."""
+    job = read_json(folder / "job.json")
+    if not isinstance(job, dict) or job.get("schema") != _SCHEMA:
         return None
-    return job if job.get("schema") == _SCHEMA else None
+    return job if job.pop("sha256", None) == _hash_json(job) else None
+
+
+def _hash_json(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def begin_job(folder: Path, fingerprint: Mapping[str, Any], *, parts: int, overwrite: bool) -> None:
     """Write what the run was asked for, before its first block."""
     job = {"schema": _SCHEMA, "overwrite": overwrite, "parts": parts, **fingerprint}
-    with new_output(folder / "job.json", overwrite=True) as temporary:
-        temporary.write_text(json.dumps(job, indent=1), encoding="utf-8")
+    with replace_file(folder / "job.json") as temporary:
+        temporary.write_text(json.dumps({**job, "sha256": _hash_json(job)}, indent=1), encoding="utf-8")
+
+
+def seal_store(folder: Path) -> None:
+    """Write down the checksum of the store of the log in a job folder."""
+    with replace_file(folder / _STORE_SUM) as temporary:
+        temporary.write_text(_hash_tree(folder / "log.zarr"), encoding="ascii")
+
+
+def remove_damage(folder: Path) -> None:
+    """Remove from a job folder what a killed run left half written, and the store of the log where its checksum is wrong."""
+    for name in filter(is_leftover, _names(folder)):
+        _remove(folder / name)
+    store, seal = folder / "log.zarr", folder / _STORE_SUM
+    try:
+        whole = seal.read_text(encoding="ascii") == _hash_tree(store)
+    except (OSError, ValueError):
+        whole = False
+    if not whole:
+        seal.unlink(missing_ok=True)
+        if store.exists():
+            _remove(store)
+
+
+def _hash_tree(folder: Path) -> str:
+    """SHA-256 of the names and the content of all files of a folder."""
+    total = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        with path.open("rb") as file:
+            total.update(f"{path.relative_to(folder).as_posix()} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
+    return total.hexdigest()
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def kept_parts(folder: Path) -> int:
@@ -246,12 +307,8 @@ def clear_job(folder: Path) -> None:
     """Forget the work in a job folder; the lock stays."""
     (folder / "job.json").unlink(missing_ok=True)
     for name in _names(folder):
-        if name == "lock":
-            continue
-        if (folder / name).is_dir():
-            shutil.rmtree(folder / name, ignore_errors=True)
-        else:
-            (folder / name).unlink(missing_ok=True)
+        if name != "lock":
+            _remove(folder / name)
 
 
 def remove_job(folder: Path, *, output: Path) -> None:
@@ -261,9 +318,3 @@ def remove_job(folder: Path, *, output: Path) -> None:
     (folder / "lock").unlink(missing_ok=True)
     with contextlib.suppress(OSError):
         folder.rmdir()
-
-
-def remove_leftovers(output: Path) -> None:
-    """Remove what a killed run left of its output under another name; only whoever holds the job may."""
-    for path in output.parent.glob(f".{glob.escape(output.name)}.????????.part"):
-        path.unlink(missing_ok=True)

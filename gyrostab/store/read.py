@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gyrostab.cf import declared_grids, decode_stamps, index_dim
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.counts import from_counts
+from gyrostab.output import remember_source
 from gyrostab.store.direct import with_fill
 from gyrostab.store.header import SMALL, Header, read_header
 from gyrostab.store.kept import KeptChunks
@@ -133,6 +134,7 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
         lazy = da.from_array(
             array, chunks=tuple(chunks), name=f"gyrostab-{name}-{opened}", asarray=False, fancy=False, inline_array=True, meta=meta
         )
+        remember_source(lazy, path.absolute())
         packing = {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)} if array.scale is not None else {}
         long[name] = xr.Variable(variable.dims, with_fill(lazy, array.fill), variable.attrs, packing)
     return long

@@ -59,10 +59,11 @@ def diagnose(
     """
     from gyrostab.diagnose.core import diagnose as run_diagnosis
     from gyrostab.diagnose.core import quiet_span
-    from gyrostab.diagnosis_folder import check_folder, write_diagnosis
+    from gyrostab.diagnosis_folder import find_foreign_file, write_diagnosis
+    from gyrostab.output import check_output
     from gyrostab.run import load_log
 
-    check_folder(output, overwrite=common.overwrite)
+    check_output(output, overwrite=common.overwrite, find_foreign=find_foreign_file)
     spans = [quiet_span(text) for text in quiet or ()]
     with work(common) as stage:
         stage("reading", 0)

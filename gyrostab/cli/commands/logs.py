@@ -58,9 +58,10 @@ def ingest(
         Of a NetCDF file: zstd is fast, zlib is read by programs that lack zstd, such as Octave and R on many systems (default: zstd).
     """
     from gyrostab.export import to_netcdf, to_zarr
-    from gyrostab.run import check_output, load_log, samples_of
+    from gyrostab.output import check_output
+    from gyrostab.run import load_log, samples_of
 
-    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite, inputs=logs)
+    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
     zarr = target.suffix.lower() == ".zarr"
     if zarr and compression:
         raise OptionError(f"--compression {compression} is for NetCDF, and {output} is Zarr; leave it out")

@@ -38,10 +38,10 @@ def report(
     """
     from gyrostab.diagnosis_folder import open_diagnosis
     from gyrostab.export import open_log, open_product
+    from gyrostab.output import check_output
     from gyrostab.report import write_diagnosis_report, write_report
-    from gyrostab.run import check_output
 
-    target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite, inputs=[product])
+    target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite)
     with work(common) as stage:
         stage("drawing", 0)
         if product.is_dir() and (product / "diagnosis.json").exists():
@@ -83,24 +83,22 @@ def correlate(
     from gyrostab.correlate import correlate as compute
     from gyrostab.correlate import format_correlation, join
     from gyrostab.export import open_product, to_netcdf
-    from gyrostab.output import new_output
+    from gyrostab.output import check_output, new_output
     from gyrostab.plot.correlation import plot_correlation
     from gyrostab.plot.style import save_png
     from gyrostab.read.channel import read_channel
-    from gyrostab.run import check_output
 
     given, file = other.options(), other.channel
-    inputs = [product, file] if file else [product]
-    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=inputs) if output else None
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite) if output else None
     picture = check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
     with work(common) as stage:
         stage("correlating", 0)
         dataset = open_product(product)
         found = compute(dataset, channel=read_channel(file, with_, **given) if file else with_, max_lag=max_lag)
         if target and picture:
-            to_netcdf(join(dataset, found), target, overwrite=common.overwrite)
             with new_output(picture, overwrite=common.overwrite) as temporary:
                 save_png(plot_correlation(found), temporary)
+                to_netcdf(join(dataset, found), target, overwrite=common.overwrite)
     print(format_correlation(found))
     if target:
         print(f"\n{target}\n{picture}")
@@ -158,11 +156,11 @@ def export(
     """
     from gyrostab.export import open_product, to_zarr
     from gyrostab.kalibr import to_kalibr
-    from gyrostab.run import check_output
+    from gyrostab.output import check_output
 
     writers: dict[str, tuple[Any, list[str]]] = {"kalibr": (to_kalibr, [".yaml", ".yml"]), "zarr": (to_zarr, [".zarr"])}
     write, suffixes = writers[format]
-    target = check_output(output, suffixes=suffixes, overwrite=common.overwrite, inputs=[product])
+    target = check_output(output, suffixes=suffixes, overwrite=common.overwrite)
     with work(common) as stage:
         stage("writing", 0)
         write(open_product(product), target, overwrite=common.overwrite)

@@ -45,10 +45,11 @@ def simulate(
         Seed of the random numbers: the same log for the same seed, the same noise with and without effects (default: the model's, or 0).
     """
     from gyrostab.export import to_netcdf, to_zarr
-    from gyrostab.run import check_output, load_log, samples_of
+    from gyrostab.output import check_output
+    from gyrostab.run import load_log, samples_of
     from gyrostab.simulate import simulate as make
 
-    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite, inputs=[model, *(like or [])])
+    target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
     with work(common) as stage:
         stage("reading", 0)
         if like:
@@ -56,6 +57,6 @@ def simulate(
         else:
             log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
         stage("simulating", samples_of(log))
-        write = to_zarr if target.suffix == ".zarr" else to_netcdf
+        write = to_zarr if target.suffix.lower() == ".zarr" else to_netcdf
         write(log, target, overwrite=common.overwrite)
     print(target)

@@ -88,9 +88,9 @@ def fit(
     """
     from gyrostab.export import open_surface, to_netcdf
     from gyrostab.fit import fit_noise
-    from gyrostab.run import check_output
+    from gyrostab.output import check_output
 
-    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite, inputs=[surface])
+    target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite)
     with work(common) as stage:
         stage("fitting", 0)
         to_netcdf(fit_noise(open_surface(surface), **fitting.options()), target, overwrite=common.overwrite)

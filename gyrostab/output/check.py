@@ -1,0 +1,201 @@
+"""Whether a path may be written: the one decision that every command and every function that writes shares."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from gyrostab.errors import OptionError, OutputError
+from gyrostab.output.content import FindForeign, find_foreign_item, is_store
+from gyrostab.output.inputs import match_files, protected_inputs
+
+__all__ = ["check_folder", "check_output", "check_target", "resolve_link"]
+
+_MAX_LINKS = 40  # as Linux has it (path_resolution(7)); more are taken for a loop
+
+
+def resolve_link(path: str | os.PathLike[str]) -> Path:
+    """Follow the symbolic links at the end of a path, so that what is replaced is their target and not the link.
+
+    Raises
+    ------
+    OutputError
+        When the links form a loop.
+    """
+    target = Path(path)
+    if target.name in ("", ".."):
+        target = Path(os.path.abspath(target))
+    for _ in range(_MAX_LINKS):
+        if not target.is_symlink():
+            return target
+        target = target.parent / os.readlink(target)
+    raise OutputError(f"output {str(path)!r} is a symbolic link in a loop; give another name with -o")
+
+
+def check_output(
+    path: str | os.PathLike[str],
+    *,
+    suffixes: Sequence[str] = (),
+    overwrite: bool = False,
+    inputs: Iterable[str | os.PathLike[str]] = (),
+    find_foreign: FindForeign | None = None,
+) -> Path:
+    """Make sure, before the long work starts, that a result can be written and that nothing else is lost by it.
+
+    A symbolic link stands for its target. An output that exists is replaced with `overwrite` only, and a folder only when all
+    that it holds was made by gyrostab or belongs to a Zarr store.
+
+    Parameters
+    ----------
+    path : path-like
+        File, Zarr folder or other folder to be written.
+    suffixes : sequence of str
+        Endings that the stage can write, with the dot; empty for any.
+    overwrite : bool
+        Whether an existing output may be replaced.
+    inputs : iterable of path-like
+        Files and patterns that are read, in addition to those of `gyrostab.output.protect_inputs`.
+    find_foreign : callable, optional
+        Makes the output a folder: finds what it holds that must not be removed. By default the output is a Zarr store when its
+        name ends in ``.zarr``, else a file.
+
+    Returns
+    -------
+    pathlib.Path
+        The path.
+
+    Raises
+    ------
+    OptionError
+        When the name has the wrong ending, is an input, or is a folder around an input or inside one.
+    OutputError
+        When the output exists and may not be replaced, or its folder cannot be written to.
+
+    Examples
+    --------
+    >>> check_output("product.txt", suffixes=[".nc"])
+    Traceback (most recent call last):
+    gyrostab.errors.OptionError: output 'product.txt' must end in .nc; give another name with -o
+    """
+    path = Path(path)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise OptionError(f"output {str(path)!r} must end in {' or '.join(suffixes)}; give another name with -o")
+    if find_foreign is None and path.suffix.lower() == ".zarr":
+        find_foreign = find_foreign_item
+    target = check_target(path, overwrite=overwrite, inputs=inputs, find_foreign=find_foreign)
+    _check_writable(path, target.parent)
+    return path
+
+
+def check_folder(folder: str | os.PathLike[str], names: Iterable[str], *, overwrite: bool = False) -> Path:
+    """Make sure that files can be written into a folder, which may hold others and need not exist yet.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder.
+    names : iterable of str
+        Names of the files.
+    overwrite : bool
+        Whether files of these names may be replaced.
+
+    Returns
+    -------
+    pathlib.Path
+        The folder.
+
+    Raises
+    ------
+    OptionError, OutputError
+        As for `check_output`, for any of the files.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"output {str(folder)!r} is a file; give the name of a folder with -o")
+    present = [name for name in names if os.path.lexists(folder / name)]
+    if present and not overwrite:
+        raise OutputError(
+            f"output {str(folder)!r} holds {', '.join(sorted(present))} already; give --overwrite to replace, or another folder with -o"
+        )
+    for name in present:
+        check_target(folder / name, overwrite=overwrite)
+    above = folder
+    while not above.exists() and above != above.parent:
+        above = above.parent
+    _check_writable(folder, above)
+    return folder
+
+
+def check_target(
+    path: Path, *, overwrite: bool, inputs: Iterable[str | os.PathLike[str]] = (), find_foreign: FindForeign | None = None
+) -> Path:
+    """As `check_output`, without trying whether the folder around it can be written to; what the path stands for."""
+    said = f"output {str(path)!r}"
+    target = resolve_link(path)
+    if not target.parent.is_dir():
+        raise OutputError(f"{said}: there is no directory {str(target.parent)!r}; make it first or choose another name with -o")
+    _check_inputs(said, target, [*protected_inputs(), *match_files(inputs)])
+    try:
+        mode = os.lstat(target).st_mode
+    except FileNotFoundError:
+        return target
+    except OSError as error:
+        raise OutputError(f"{said} cannot be written ({error.strerror}); give another name with -o") from error
+    if find_foreign is None:
+        if stat.S_ISDIR(mode):
+            raise OutputError(f"{said} is a directory; give another name with -o")
+        if not stat.S_ISREG(mode):
+            raise OutputError(f"{said} is no regular file and is not replaced; give another name with -o")
+    elif not stat.S_ISDIR(mode):
+        raise OutputError(f"{said} is a file, and a folder is to be written; give another name with -o")
+    elif (foreign := _find_foreign(said, target, find_foreign)) is not None:
+        raise OutputError(
+            f"{said} holds {foreign!r}, which gyrostab did not make, so it is not replaced, not even with --overwrite; "
+            "give another name with -o"
+        )
+    if not overwrite:
+        raise OutputError(f"{said} exists already; give --overwrite (overwrite=True) to replace it, or another name with -o")
+    return target
+
+
+def _find_foreign(said: str, target: Path, find_foreign: FindForeign) -> str | None:
+    try:
+        return find_foreign(target)
+    except OSError as error:
+        raise OutputError(f"{said}: its content cannot be listed ({error.strerror}); give another name with -o") from error
+
+
+def _check_inputs(said: str, target: Path, inputs: Sequence[Path]) -> None:
+    """Compare by identity, which links and other spellings of a path do not change."""
+    own, place = _find_status(target), os.path.realpath(target)
+    folder = own is not None and stat.S_ISDIR(own.st_mode)
+    for item in inputs:
+        found = _find_status(item)
+        if found is None:
+            continue
+        if own is not None and os.path.samestat(own, found):
+            raise OptionError(f"{said} is also an input and would be destroyed; give another name with -o")
+        if folder and os.path.realpath(item).startswith(os.path.join(place, "")):
+            raise OptionError(f"{said} is a folder around the input {str(item)!r}, which would be destroyed; give another name with -o")
+        inside = stat.S_ISDIR(found.st_mode) and place.startswith(os.path.join(os.path.realpath(item), ""))
+        if inside and is_store(item):
+            raise OptionError(f"{said} lies inside the input {str(item)!r}, which would be changed; give another name with -o")
+
+
+def _find_status(path: Path) -> os.stat_result | None:
+    """Status of what a path stands for; None when there is nothing."""
+    try:
+        return path.stat()
+    except OSError:
+        return None
+
+
+def _check_writable(path: Path, folder: Path) -> None:
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputError(f"output {str(path)!r}: nothing can be written in {str(folder)!r} ({error.strerror})") from error

@@ -1,0 +1,152 @@
+"""The files that a command reads: no output may replace or contain one, and none may change before the output is complete."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+from gyrostab.errors import FormatError
+from gyrostab.output.content import is_store
+
+__all__ = [
+    "check_unchanged",
+    "describe_file",
+    "find_sources",
+    "match_files",
+    "pass_sources",
+    "protect_inputs",
+    "protected_inputs",
+    "remember_source",
+]
+
+#: Inputs of the work under way, each with what `describe_file` said of it at first; None where a change does no harm.
+_PROTECTED: ContextVar[dict[Path, dict[str, Any] | None] | None] = ContextVar("_PROTECTED", default=None)
+#: Names of lazy arrays -> files that they read.
+_SOURCES: dict[str, set[Path]] = {}
+
+
+def describe_file(path: Path) -> dict[str, Any]:
+    """Size [bytes] and time of change of a file; of a folder (Zarr) those of all its files together."""
+    try:
+        if not path.is_dir():
+            found = path.stat()
+            return {"bytes": found.st_size, "changed_ns": found.st_mtime_ns}
+        listing = sorted(_list_files(str(path), ""))
+    except OSError:
+        return {"bytes": None, "changed_ns": None}
+    return {
+        "bytes": sum(size for _, size, _ in listing),
+        "changed_ns": max((changed for *_, changed in listing), default=0),
+        "files": len(listing),
+        "listing": hashlib.sha256(json.dumps(listing).encode()).hexdigest(),
+    }
+
+
+def _list_files(folder: str, inside: str) -> Iterator[tuple[str, int, int]]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            name = f"{inside}{entry.name}"
+            if entry.is_dir():
+                yield from _list_files(entry.path, f"{name}/")
+            else:
+                found = entry.stat()
+                yield name, found.st_size, found.st_mtime_ns
+
+
+def match_files(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """The files and folders that exist under a name or pattern, or several."""
+    found: dict[Path, None] = {}
+    for path in [paths] if isinstance(paths, str | os.PathLike) else paths:
+        item = os.fspath(path)
+        names = [item] if os.path.lexists(item) or not glob.has_magic(item) else glob.glob(item, recursive=True)
+        found.update((Path(name), None) for name in names if os.path.lexists(name))
+    return list(found)
+
+
+@contextlib.contextmanager
+def protect_inputs(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> Iterator[None]:
+    """Refuse, for the length of the ``with`` block, every output that would replace one of these files or a folder around it.
+
+    An output is also refused where one of them has changed before the output is complete, except for TOML files, which are read
+    at once.
+
+    Parameters
+    ----------
+    paths : path-like, or several of them
+        Files, folders and patterns.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from gyrostab.output import check_output
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     log = Path(folder, "log.nc")
+    ...     _ = log.write_text("samples")
+    ...     with protect_inputs([log]):
+    ...         check_output(log, overwrite=True)
+    Traceback (most recent call last):
+    gyrostab.errors.OptionError: output '...log.nc' is also an input and would be destroyed; give another name with -o
+    """
+    before = _PROTECTED.get() or {}
+    files = {path: _describe_data(path) for path in match_files(paths) if path not in before}
+    token = _PROTECTED.set({**before, **files})
+    try:
+        yield
+    finally:
+        _PROTECTED.reset(token)
+
+
+def _describe_data(path: Path) -> dict[str, Any] | None:
+    """What to compare later of a file that is read all the while: a regular one, or a store."""
+    data = path.suffix.lower() != ".toml" and (path.is_file() or is_store(path))
+    return describe_file(path) if data else None
+
+
+def protected_inputs() -> list[Path]:
+    """List the inputs of the work under way."""
+    return list(_PROTECTED.get() or ())
+
+
+def check_unchanged() -> None:
+    """Raise `FormatError` when an input of the work under way has changed since it began."""
+    for path, before in (_PROTECTED.get() or {}).items():
+        if before is not None and describe_file(path) != before:
+            what = "has changed" if path.exists() else "has vanished"
+            raise FormatError(f"{path}: {what} while it was read, so nothing was written; start again once it is complete")
+
+
+def remember_source(array: Any, path: Path) -> None:
+    """Remember the file that a lazy array reads."""
+    _SOURCES[array.name] = {path}
+
+
+def pass_sources(array: Any, *derived: Any) -> None:
+    """Remember that lazy arrays read what another one reads, where their graphs do not show it."""
+    for made in derived:
+        _SOURCES[made.name] = _find_array_sources(array)
+
+
+def _find_array_sources(array: Any) -> set[Path]:
+    return set().union(*(_SOURCES.get(layer, ()) for layer in array.__dask_graph__().layers))
+
+
+def find_sources(dataset: Any) -> list[Path]:
+    """Find the files that a lazy `xarray.Dataset` still reads from, as far as they are known.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> find_sources(xr.Dataset({"rate": ("time", [1.0])}))
+    []
+    """
+    lazy = [variable for variable in dataset.variables.values() if not variable._in_memory]
+    named = [variable.encoding.get("source") for variable in lazy] + [dataset.encoding.get("source") if lazy else None]
+    found = {Path(path) for path in named if path is not None}
+    return sorted(found.union(*(_find_array_sources(variable.data) for variable in lazy if variable.chunks is not None)))

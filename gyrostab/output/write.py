@@ -1,0 +1,324 @@
+"""Files and folders that take their name only once they are complete."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import glob
+import os
+import re
+import secrets
+import shutil
+import sys
+import time
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from gyrostab.errors import GyrostabError, OutputError
+from gyrostab.output.check import check_folder, check_target
+from gyrostab.output.content import FindForeign
+from gyrostab.output.inputs import check_unchanged
+
+__all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "replace_file"]
+
+#: Looks, 20 ms apart, after which what has gone stays gone: a busy machine may hold a thread up that long.
+_LOOKS = 15
+_MAX_NAME_BYTES = 255  # of one file name on the usual file systems
+_LEFTOVER = re.compile(r"\.(.*\.)?gyrostab-[0-9a-f]{8}\.part")
+
+
+@contextlib.contextmanager
+def new_output(
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    find_foreign: FindForeign | None = None,
+    inputs: Iterable[str | os.PathLike[str]] = (),
+) -> Iterator[Path]:
+    """Give a temporary name beside `path` to write to; rename it to `path` when the block succeeds, remove it when not.
+
+    Parameters
+    ----------
+    path : path-like
+        The final name; a symbolic link stands for its target.
+    overwrite : bool
+        Replace what has this name.
+    find_foreign : callable, optional
+        Makes the output a folder, and finds what an existing one holds that must not be removed; see
+        `gyrostab.output.check_output`.
+    inputs : iterable of path-like
+        Files that are read, which must not be replaced, in addition to those of `gyrostab.output.protect_inputs`.
+
+    Yields
+    ------
+    pathlib.Path
+        Name to write to, in the same directory.
+
+    Raises
+    ------
+    OptionError
+        When `path` is an input, or a folder around one.
+    OutputError
+        When `path` exists and may not be replaced, or when the block fails to write.
+    FormatError
+        When an input has changed meanwhile.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with new_output(folder + "/note.txt") as temporary:
+    ...         _ = temporary.write_text("complete")
+    ...     os.listdir(folder)
+    ['note.txt']
+    """
+    path = Path(path)
+
+    def check() -> Path:
+        return check_target(path, overwrite=overwrite, inputs=inputs, find_foreign=find_foreign)
+
+    target = check()
+    for left in _find_leftovers(target):
+        warnings.warn(f"{left} is being written now, or was left by a process that was killed: then delete it", stacklevel=3)
+    hidden = target.with_name(_hide_name(target.name))
+    with _temporary_output(target, hidden, make_folder=find_foreign is not None) as temporary:
+        yield temporary
+        _sync_tree(temporary)
+        check_unchanged()
+        check()
+        if find_foreign is not None and target.is_dir():
+            _replace_folder(temporary, target, find_foreign)
+        elif overwrite and find_foreign is None:
+            os.replace(temporary, target)
+            _sync(target.parent)
+        else:
+            _rename_new(temporary, target)
+
+
+@contextlib.contextmanager
+def replace_file(path: Path) -> Iterator[Path]:
+    """As `new_output`, of a file inside a folder that gyrostab made, which is replaced in any case."""
+    with _temporary_output(path, path.with_name(_hide_name(path.name)), make_folder=False) as temporary:
+        yield temporary
+        _sync_tree(temporary)
+        os.replace(temporary, path)
+        _sync(path.parent)
+
+
+@contextlib.contextmanager
+def new_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+    """Give a temporary folder to write files to; move them into `folder` when the block succeeds, and remove them when not.
+
+    Whatever else `folder` holds stays as it is.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder; it is made, with those above it, when it does not exist.
+    overwrite : bool
+        Replace files of the same names.
+
+    Yields
+    ------
+    pathlib.Path
+        Folder to write to.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be made or written to, or holds a file of one of the names and `overwrite` is not given.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as name:
+    ...     with new_folder(name + "/figures") as temporary:
+    ...         _ = (temporary / "davar.png").write_bytes(b"")
+    ...     os.listdir(name + "/figures")
+    ['davar.png']
+    """
+    folder = Path(folder)
+    made = _make_folder(folder)
+    try:
+        with _temporary_output(folder, folder / _hide_name(""), make_folder=True) as temporary:
+            yield temporary
+            _sync_tree(temporary)
+            check_unchanged()
+            check_folder(folder, os.listdir(temporary), overwrite=overwrite)
+            for name in sorted(os.listdir(temporary)):
+                target = check_target(folder / name, overwrite=overwrite)
+                (os.replace if overwrite else _rename_new)(temporary / name, target)
+            temporary.rmdir()
+    except BaseException:
+        for level in made:
+            with contextlib.suppress(OSError):  # another process has put something there
+                level.rmdir()
+        raise
+
+
+def _make_folder(folder: Path) -> list[Path]:
+    """Make a folder with those above it; those that were made, the innermost first."""
+    missing = [level for level in (folder, *folder.parents) if not level.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"folder {str(folder)!r} cannot be made ({error.strerror}); give another one with -o") from error
+    return missing
+
+
+@contextlib.contextmanager
+def _temporary_output(target: Path, temporary: Path, *, make_folder: bool) -> Iterator[Path]:
+    """Make a hidden file or folder, remove it when the block fails, and explain why the output could not be written."""
+    complete = False
+    try:
+        if make_folder:
+            temporary.mkdir()
+        else:
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        yield temporary
+        complete = True
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, GyrostabError) or (isinstance(error, RuntimeError) and not str(error).startswith("NetCDF:")):
+            raise
+        raise OutputError(f"{target}: cannot be written: {_reason(error, target)}") from error
+    finally:
+        if not complete:
+            _remove(temporary)
+
+
+def _hide_name(name: str) -> str:
+    """A hidden name that no other process takes, of a file or folder that is being written."""
+    mark = f".gyrostab-{secrets.token_hex(4)}.part"
+    return f".{name}{mark}" if name and len(os.fsencode(f".{name}{mark}")) <= _MAX_NAME_BYTES else mark
+
+
+def is_leftover(name: str) -> bool:
+    """Whether a file name is one that outputs have until they are complete.
+
+    Examples
+    --------
+    >>> is_leftover(".log.nc.gyrostab-0123abcd.part"), is_leftover(".log.nc.part")
+    (True, False)
+    """
+    return _LEFTOVER.fullmatch(name) is not None
+
+
+def _find_leftovers(target: Path) -> list[Path]:
+    found = glob.glob(f".{glob.escape(target.name)}.gyrostab-????????.part", root_dir=target.parent)
+    return [target.parent / name for name in sorted(found) if is_leftover(name)]
+
+
+def remove_leftovers(output: Path) -> None:
+    """Remove what a killed process left of its output under a hidden name; only for a process that no other can write beside."""
+    for path in _find_leftovers(output):
+        _remove_tree(path)
+
+
+def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) -> None:
+    """Let a complete folder and an older one change places, and remove the older one."""
+    if _rename(temporary, target, _EXCHANGE):
+        if find_foreign(temporary) is not None:  # someone has put something there since it was looked through
+            _rename(temporary, target, _EXCHANGE)
+            raise OutputError(f"{target}: has changed while the new one was written, so it is not replaced; give another name with -o")
+    else:
+        aside = target.with_name(_hide_name(target.name))
+        target.rename(aside)
+        try:
+            temporary.rename(target)
+        except BaseException:
+            aside.rename(target)
+            raise
+        temporary = aside
+    _sync(target.parent)
+    _remove_tree(temporary)
+    if temporary.exists():
+        warnings.warn(f"{temporary}: the folder that was replaced cannot be removed; delete it", stacklevel=4)
+
+
+def _rename_new(source: Path, target: Path) -> None:
+    """Rename a file or folder unless something has the name already, in one step where the system can."""
+    try:
+        if not _rename(source, target, _NO_REPLACE):
+            if os.path.lexists(target):
+                raise FileExistsError
+            os.rename(source, target)
+    except FileExistsError:
+        raise OutputError(
+            f"output {str(target)!r} exists already: another process has made it meanwhile; give --overwrite (overwrite=True) to replace it"
+        ) from None
+    _sync(target.parent)
+
+
+# linux/fs.h; both flags are of Linux 3.15
+_NO_REPLACE, _EXCHANGE = 1, 2
+_AT_FDCWD = -100
+_UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
+
+
+def _rename(source: Path, target: Path, flag: int) -> bool:
+    """Rename with a flag of ``renameat2``; False where the system or the file system has no such call."""
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
+    if call is None:
+        return False
+    if call(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in _UNSUPPORTED:
+        return False
+    raise OSError(number, os.strerror(number), str(target))
+
+
+def _sync_tree(path: Path) -> None:
+    """Bring a file, or a folder with all that is in it, to the disk."""
+    for folder, _, names in os.walk(path):
+        for name in names:
+            _sync(Path(folder, name))
+        _sync(Path(folder))
+    if not path.is_dir():
+        _sync(path)
+
+
+def _sync(path: Path) -> None:
+    """Ask the system to bring a file (or the entries of a directory) to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove(path: Path) -> None:
+    """Remove what was written; a thread that still writes its piece of a directory may bring it back, so look again."""
+    folder, gone = path.is_dir(), 0
+    for _ in range(100):
+        _remove_tree(path)
+        gone = 0 if path.exists() else gone + 1
+        if gone == _LOOKS or not folder:
+            return
+        time.sleep(0.02)
+
+
+def _remove_tree(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def _reason(error: Exception, path: Path) -> str:
+    if isinstance(error, PermissionError):
+        return f"no permission to write in {path.parent}; choose another directory"
+    number = (error.errno or 0) if isinstance(error, OSError) else 0
+    text = os.strerror(number) if number > 0 else str(error)
+    if number > 0 and number not in _FULL:
+        return text
+    with contextlib.suppress(OSError):  # the NetCDF and HDF5 libraries say no more than "HDF error"
+        free = shutil.disk_usage(path.parent).free / 2**20
+        text += f"; {free:,.0f} MiB are free there: is the disk full, or a quota or size limit reached?"
+    return text
