@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from gyrostab.clock import time_of_day
 from gyrostab.errors import FormatError, SchemaError
+from gyrostab.names import restore_names, store_names
 from gyrostab.parts import transposed
 from gyrostab.schema import check_log, check_product, check_surface, texts
 from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
@@ -60,6 +61,7 @@ def _kind(dataset: xr.Dataset) -> str:
 def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
     """Lay a dataset out as the file shall hold it; `verb` goes to its history."""
     kind = _kind(dataset)
+    dataset = store_names(dataset)
     grids = _grids(dataset, kind)
     divisor = 1000 if _whole_microseconds(dataset, grids) else 1
     since = {"units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}", **_CALENDAR}
@@ -234,6 +236,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
         indexes |= axis.xindexes
         coords[grids[name]["dim"]].attrs = json.loads(stored.variables[name].attrs.get("axis_attributes", "{}"))
     dataset = xr.Dataset(variables, xr.Coordinates(coords, indexes=indexes), _attributes_from_disk(dict(stored.attrs)))
+    dataset = restore_names(dataset)
     dataset.set_close(close)
     return dataset
 

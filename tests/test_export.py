@@ -23,7 +23,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gyrostab import export
-from gyrostab.errors import FormatError, SchemaError
+from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.export import open_dataset, open_log, open_product, open_surface, to_netcdf, to_zarr
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
@@ -290,7 +290,9 @@ def test_a_lazy_log_is_never_held_whole(tmp_path):
 
 def test_a_file_can_be_rewritten_from_itself(tmp_path):
     path = to_netcdf(synthetic.product(), tmp_path / "p.nc")
-    to_netcdf(open_product(path), path, overwrite=True)
+    with pytest.raises(OptionError, match=r"load the dataset first, with its load\(\)"):
+        to_netcdf(open_product(path), path, overwrite=True)
+    to_netcdf(open_product(path).load(), path, overwrite=True)
     assert_same(synthetic.product(), open_product(path))
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import gyrostab
 from gyrostab import davar, fit_noise, make_log, open_log, to_netcdf, to_zarr
 from gyrostab.errors import GyrostabError, OptionError, OutputError
 from gyrostab.output import check_output, find_foreign_item, new_folder, new_output, protect_inputs
+from gyrostab.run import run
 from gyrostab.run.job import folder_of
 
 from .command_line import WINDOW, call, write_log
@@ -196,7 +196,7 @@ def test_the_functions_refuse_what_the_commands_refuse(folder):
     with pytest.raises(OutputError, match=r"tide\.jpg"):
         to_zarr(log, folder / "photos.zarr", overwrite=True)
     with pytest.raises(OptionError, match="is also an input"):
-        gyrostab.run.run([folder / "log.nc"], folder / "log.nc", overwrite=True)
+        run([folder / "log.nc"], folder / "log.nc", windows={"window": "20s"}, overwrite=True)
     assert read_tree(folder) == before
     to_netcdf(log.load(), folder / "log.nc", overwrite=True)
 
@@ -236,9 +236,14 @@ def test_figures_that_cannot_be_finished_leave_nothing(folder, monkeypatch):
 
 def test_a_folder_of_files_is_checked_before_the_first_is_moved(tmp_path):
     (tmp_path / "b.txt").mkdir()
-    with pytest.raises(OutputError, match="is a directory"), new_folder(tmp_path, overwrite=True) as temporary:
-        for name in ("a.txt", "b.txt"):
-            (temporary / name).write_text("new")
+
+    def write() -> None:
+        with new_folder(tmp_path, overwrite=True) as temporary:
+            (temporary / "a.txt").write_text("new")
+            (temporary / "b.txt").write_text("new")
+
+    with pytest.raises(OutputError, match="is a directory"):
+        write()
     assert [path.name for path in tmp_path.iterdir()] == ["b.txt"]
 
 
@@ -301,11 +306,18 @@ def test_what_another_process_has_made_meanwhile_is_not_replaced(tmp_path, suffi
     write = to_netcdf if suffix == "nc" else to_zarr
     target = tmp_path / f"log.{suffix}"
     options = {"find_foreign": find_foreign_item} if suffix == "zarr" else {}
-    with pytest.raises(OutputError, match="exists already"), new_output(target, **options) as temporary:
-        write(log, target)
-        before = read_tree(tmp_path)
-        (temporary / "x" if suffix == "zarr" else temporary).write_text("late")
-    assert {name: value for name, value in before.items() if ".part" not in name} == read_tree(tmp_path)
+    kept: dict[str, object] = {}
+
+    def write_late() -> None:
+        with new_output(target, **options) as temporary:
+            with pytest.warns(UserWarning, match="is being written now"):
+                write(log, target)
+            kept.update(read_tree(tmp_path))
+            (temporary / "x" if suffix == "zarr" else temporary).write_text("late")
+
+    with pytest.raises(OutputError, match="exists already"):
+        write_late()
+    assert {name: value for name, value in kept.items() if ".part" not in name} == read_tree(tmp_path)
 
 
 @pytest.mark.parametrize("renameat2", [True, False])

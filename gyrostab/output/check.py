@@ -57,7 +57,7 @@ def check_output(
     overwrite : bool
         Whether an existing output may be replaced.
     inputs : iterable of path-like
-        Files and patterns that are read, in addition to those of `gyrostab.output.protect_inputs`.
+        Files that a lazy dataset reads, in addition to those of `gyrostab.output.protect_inputs`.
     find_foreign : callable, optional
         Makes the output a folder: finds what it holds that must not be removed. By default the output is a Zarr store when its
         name ends in ``.zarr``, else a file.
@@ -137,7 +137,8 @@ def check_target(
     target = resolve_link(path)
     if not target.parent.is_dir():
         raise OutputError(f"{said}: there is no directory {str(target.parent)!r}; make it first or choose another name with -o")
-    _check_inputs(said, target, [*protected_inputs(), *match_files(inputs)])
+    _check_inputs(said, target, protected_inputs(), "give another name with -o")
+    _check_inputs(said, target, match_files(inputs), "load the dataset first, with its load(), or give another name")
     try:
         mode = os.lstat(target).st_mode
     except FileNotFoundError:
@@ -168,7 +169,7 @@ def _find_foreign(said: str, target: Path, find_foreign: FindForeign) -> str | N
         raise OutputError(f"{said}: its content cannot be listed ({error.strerror}); give another name with -o") from error
 
 
-def _check_inputs(said: str, target: Path, inputs: Sequence[Path]) -> None:
+def _check_inputs(said: str, target: Path, inputs: Sequence[Path], advice: str) -> None:
     """Compare by identity, which links and other spellings of a path do not change."""
     own, place = _find_status(target), os.path.realpath(target)
     folder = own is not None and stat.S_ISDIR(own.st_mode)
@@ -177,12 +178,12 @@ def _check_inputs(said: str, target: Path, inputs: Sequence[Path]) -> None:
         if found is None:
             continue
         if own is not None and os.path.samestat(own, found):
-            raise OptionError(f"{said} is also an input and would be destroyed; give another name with -o")
+            raise OptionError(f"{said} is also an input and would be destroyed; {advice}")
         if folder and os.path.realpath(item).startswith(os.path.join(place, "")):
-            raise OptionError(f"{said} is a folder around the input {str(item)!r}, which would be destroyed; give another name with -o")
+            raise OptionError(f"{said} is a folder around the input {str(item)!r}, which would be destroyed; {advice}")
         inside = stat.S_ISDIR(found.st_mode) and place.startswith(os.path.join(os.path.realpath(item), ""))
         if inside and is_store(item):
-            raise OptionError(f"{said} lies inside the input {str(item)!r}, which would be changed; give another name with -o")
+            raise OptionError(f"{said} lies inside the input {str(item)!r}, which would be changed; {advice}")
 
 
 def _find_status(path: Path) -> os.stat_result | None:

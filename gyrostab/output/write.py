@@ -49,7 +49,7 @@ def new_output(
         Makes the output a folder, and finds what an existing one holds that must not be removed; see
         `gyrostab.output.check_output`.
     inputs : iterable of path-like
-        Files that are read, which must not be replaced, in addition to those of `gyrostab.output.protect_inputs`.
+        Files that a lazy dataset reads, which must not be replaced, in addition to those of `gyrostab.output.protect_inputs`.
 
     Yields
     ------

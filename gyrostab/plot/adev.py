@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import COLOURS, axis_names, axis_style, new_figure, stack_panels
+from gyrostab.plot.style import COLOURS, axis_names, axis_style, literal_text, new_figure, stack_panels
 from gyrostab.schema import OBSERVABLE, check_surface
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ _LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed
 _DASHES = ("--", "-.", ":", (0, (6, 2, 1, 2, 1, 2)), (0, (8, 3)))
 
 
+@literal_text
 def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     """Draw the Allan deviation of one window over averaging time, with its 95 % band and the fitted noise terms.
 

@@ -14,6 +14,7 @@ from gyrostab.plot.style import (
     axis_names,
     axis_style,
     label_log_axis,
+    literal_text,
     new_figure,
     require_coefficients,
     shade_spans,
@@ -32,6 +33,7 @@ __all__ = ["plot_coefficients"]
 _NOT, _LIMIT, _SEEN = (OBSERVABLE.index(name) for name in ("not_observable", "upper_limit_only", "observed"))
 
 
+@literal_text
 def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure:
     """Draw Q, N, B, K and R over time, one panel each: bands are standard errors, triangles pointing down are 95 % upper limits.
 

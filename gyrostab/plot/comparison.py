@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError
 from gyrostab.log import make_log
 from gyrostab.plot.signal import thin
-from gyrostab.plot.style import COLOURS, GREY, label_log_axis, new_figure, unit_label
+from gyrostab.plot.style import COLOURS, GREY, label_log_axis, literal_text, new_figure, unit_label
 from gyrostab.plot.surface import CHANGE_CMAP
 from gyrostab.schema import check_log, signal_name
 from gyrostab.windows import duration_seconds
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 _STYLES: tuple[dict[str, Any], dict[str, Any]] = ({"color": GREY, "lw": 2.4}, {"color": COLOURS[0], "lw": 1.1})
 
 
+@literal_text
 def plot_comparison(
     without: xr.Dataset,
     with_it: xr.Dataset,

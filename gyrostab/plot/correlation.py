@@ -10,7 +10,7 @@ import xarray as xr
 from gyrostab.correlate.judge import VERDICTS, chance
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import COLOURS, axis_names, new_figure, unit_label
+from gyrostab.plot.style import COLOURS, axis_names, literal_text, new_figure, unit_label
 from gyrostab.schema import OBSERVABLE
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ _UP, _DOWN = COLOURS[1], COLOURS[0]
 _MOST = 3000
 
 
+@literal_text
 def plot_correlation(result: xr.Dataset, *, axis: str | None = None, driver: str | None = None) -> Figure:
     """Draw every variable against the channel at its lag, one row a variable and one column an axis.
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.plot.style import COLOURS, GREY, label_log_axis, log_edges, new_figure, unit_label, unit_of_time
+from gyrostab.plot.style import COLOURS, GREY, label_log_axis, literal_text, log_edges, new_figure, unit_label, unit_of_time
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -106,6 +106,7 @@ def _maps(
     return figure
 
 
+@literal_text
 def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     """Draw the Allan deviation over time and averaging time: recording, simulation before, simulation after.
 
@@ -130,6 +131,7 @@ def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     return _maps(surfaces, content, columns, norm, "viridis", "Allan deviation [deg/h]")
 
 
+@literal_text
 def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     """Draw the Allan deviation of the recording over that of the simulation, before and after."""
     from matplotlib.colors import LogNorm
@@ -153,6 +155,7 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     return figure
 
 
+@literal_text
 def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     """Draw the mean rate over time with what the simulation says, and the channels beneath.
 
@@ -224,6 +227,7 @@ def _mark_spans(panel: Axes, axis: str, content: Mapping[str, Any], size: float)
             )  # fmt: skip
 
 
+@literal_text
 def plot_deviations(surfaces: xr.Dataset) -> Figure:
     """Draw the Allan deviation of the whole record, one panel an axis."""
     names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
@@ -242,6 +246,7 @@ def plot_deviations(surfaces: xr.Dataset) -> Figure:
     return figure
 
 
+@literal_text
 def plot_spectra(surfaces: xr.Dataset) -> Figure:
     """Draw the power spectrum of the whole record, one panel an axis.
 

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.plot.style import axis_names, axis_style, new_figure, shade_spans, stack_panels, time_axis, unit_label
+from gyrostab.plot.style import axis_names, axis_style, literal_text, new_figure, shade_spans, stack_panels, time_axis, unit_label
 from gyrostab.schema import log_channels, signal_name
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ __all__ = ["plot_signal", "thin"]
 _BLOCK = 2**22  # samples read at a time: 32 MiB
 
 
+@literal_text
 def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[str] | None = None, columns: int = 1500) -> Figure:
     """Draw the gyro signal of all axes with the channels below; gaps are grey.
 

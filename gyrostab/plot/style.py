@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import os
-from collections.abc import Sequence
-from typing import IO, TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import IO, TYPE_CHECKING, Any, ParamSpec
 
 import numpy as np
 import xarray as xr
@@ -28,6 +29,7 @@ __all__ = [
     "duration",
     "embedded",
     "label_log_axis",
+    "literal_text",
     "log_edges",
     "new_figure",
     "save_png",
@@ -38,6 +40,8 @@ __all__ = [
     "unit_of_time",
     "window_text",
 ]
+
+P = ParamSpec("P")
 
 #: Okabe and Ito's palette, without its yellow, which vanishes in print.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -133,6 +137,32 @@ def new_figure(width: float, height: float, *, stacked: bool = False) -> Figure:
     return figure
 
 
+def literal_text(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Show the texts of the figures that a function draws as they are: names and units of a log are no formulas of matplotlib."""
+
+    @functools.wraps(draw)
+    def draw_literally(*arguments: P.args, **options: P.kwargs) -> Figure:
+        figure = draw(*arguments, **options)
+        _keep_literal(figure)
+        return figure
+
+    return draw_literally
+
+
+def _keep_literal(artist: Any) -> None:
+    """Let no text of an artist be parsed, apart from the tick labels, which may hold powers of ten."""
+    from matplotlib.axis import Axis
+    from matplotlib.text import Text
+
+    for child in artist.get_children():
+        if isinstance(child, Axis):
+            child.label.set_parse_math(False)
+            continue
+        if isinstance(child, Text):
+            child.set_parse_math(False)
+        _keep_literal(child)
+
+
 def stack_panels(panels: Sequence[Axes] | NDArray[Any], *, between: float = 0.13, below: float = 0.0, right: float = 0.2) -> None:
     """Lay out panels that stand above each other, with their y labels in one line left of the widest tick label.
 
@@ -152,6 +182,7 @@ def stack_panels(panels: Sequence[Axes] | NDArray[Any], *, between: float = 0.13
     from matplotlib.transforms import ScaledTranslation
 
     figure: Any = panels[0].figure
+    _keep_literal(figure)  # before the labels are measured
     width, height = figure.get_size_inches()
     top, bottom = 0.3 + between, 0.55 + below
     average = (height - top - bottom - between * (len(panels) - 1)) / len(panels)

@@ -9,7 +9,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.plot.style import axis_names, label_log_axis, log_edges, new_figure, stack_panels, time_axis, unit_of_time, window_text
+from gyrostab.plot.style import (
+    axis_names,
+    label_log_axis,
+    literal_text,
+    log_edges,
+    new_figure,
+    stack_panels,
+    time_axis,
+    unit_of_time,
+    window_text,
+)
 from gyrostab.schema import ESTIMATORS, check_surface
 
 if TYPE_CHECKING:
@@ -23,6 +33,7 @@ CHANGE_CMAP = "PuOr_r"  # two hues that colour-blind readers tell apart, white w
 _WEIGHTED = ESTIMATORS.index("weighted_clusters")
 
 
+@literal_text
 def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool = False, columns: int = 1500) -> Figure:
     """Draw the Allan deviation as colour over time and averaging time, one panel an axis.
 
@@ -96,6 +107,7 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
     return figure
 
 
+@literal_text
 def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int = 120) -> Figure:
     """Draw the Allan deviation of one axis as a surface over time and log averaging time.
 

@@ -1,0 +1,76 @@
+"""Names that a file can hold: those of other variables are stored under safe ones, and come back when the file is opened."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Iterable
+from typing import Any
+
+import xarray as xr
+
+__all__ = ["is_storable", "restore_names", "store_names"]
+
+# NetCDF User's Guide, "Permitted characters in netCDF names"; Zarr adds that a name is part of a path, and reserves two underscores.
+_STORABLE = re.compile(r"(?!__)[A-Za-z0-9_\x80-\ud7ff\ue000-\U0010ffff][^/\x00-\x1f\x7f\ud800-\udfff]*(?<! )")
+_MAX_NAME_BYTES = 200  # NetCDF allows 256, a file name 255, and a suffix for the time axis comes on top
+_ORIGINAL = "original_name"
+
+
+def is_storable(name: str) -> bool:
+    """Whether NetCDF and Zarr can hold a variable or dimension of this name.
+
+    Examples
+    --------
+    >>> is_storable("température 2"), is_storable("a/b"), is_storable("{{7*7}}"), is_storable(".zattrs")
+    (True, False, False, False)
+    """
+    return _STORABLE.fullmatch(name) is not None and len(name.encode()) <= _MAX_NAME_BYTES
+
+
+def _make_safe(name: str, taken: Iterable[str]) -> str:
+    plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")[: _MAX_NAME_BYTES // 2]
+    plain = plain if plain[:1].isalpha() else f"channel_{plain}".rstrip("_")
+    safe, number = plain, 1
+    while safe in taken:
+        number += 1
+        safe = f"{plain}_{number}"
+    return safe
+
+
+def store_names(dataset: xr.Dataset) -> xr.Dataset:
+    """Give safe names to the variables whose own names no file can hold; a warning and ``long_name`` tell the own ones.
+
+    Examples
+    --------
+    >>> with warnings.catch_warnings(record=True):
+    ...     store_names(xr.Dataset({"{{7*7}}": 1.0}))["channel_7_7"].attrs["long_name"]
+    '{{7*7}}'
+    """
+    taken = {str(name) for name in (*dataset.variables, *dataset.dims)}
+    safe: dict[str, str] = {}
+    for name in (str(name) for name in dataset.variables if not is_storable(str(name))):
+        if name not in (f"time_{other}" for other in dataset.variables):
+            safe[name] = _make_safe(name, taken)
+            taken.add(safe[name])
+    if not safe:
+        return dataset
+    renamed = dataset.rename({**safe, **{f"time_{name}": f"time_{other}" for name, other in safe.items() if f"time_{name}" in taken}})
+    for name, other in safe.items():
+        shown = name.encode("utf-8", "backslashreplace").decode()  # half a character may stand in a name that was read wrongly
+        renamed[other].attrs = {"long_name": shown, **renamed[other].attrs, _ORIGINAL: json.dumps(name)}
+    told = ", ".join(f"{name!a} as {other!r}" for name, other in safe.items())
+    warnings.warn(f"a file cannot hold a channel of this name, so it is stored under another one: {told}", stacklevel=4)
+    return renamed
+
+
+def restore_names(dataset: xr.Dataset) -> xr.Dataset:
+    """Give back the names that `store_names` replaced."""
+    own: dict[Any, str] = {}
+    for name, variable in dataset.variables.items():
+        if _ORIGINAL in variable.attrs:
+            own[name] = json.loads(variable.attrs.pop(_ORIGINAL))
+    if not own:
+        return dataset
+    return dataset.rename({**own, **{f"time_{name}": f"time_{other}" for name, other in own.items() if f"time_{name}" in dataset.dims}})
