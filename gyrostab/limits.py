@@ -21,6 +21,7 @@ __all__ = [
     "Limit",
     "bytes_present",
     "check_chunk",
+    "check_columns",
     "check_limits",
     "check_stored",
     "describe_limit",
@@ -40,10 +41,16 @@ class Limit:
 
 LIMITS: Mapping[str, Limit] = {
     "columns": Limit(
-        20_000,
+        30_000,
         "columns",
-        "A logger writes tens of columns. The header of this many is understood in about a second; beyond it the separator is "
-        "probably wrong, or the table is transposed.",
+        "A logger writes tens of columns, a bus recorder thousands. The header of this many is understood in a few seconds; beyond it "
+        "the separator is probably wrong, or the table is transposed.",
+    ),
+    "channels": Limit(
+        200,
+        "channels",
+        "A channel takes 8 bytes a row in memory or in a temporary file, and xarray looks through all variables for each of them. "
+        "Channels with a known name, and those that --map or --unit names, are kept beyond it.",
     ),
     "grid_samples": Limit(
         1e9,
@@ -103,7 +110,7 @@ def limit_value(name: str, given: Mapping[str, float] | None = None) -> float:
     Examples
     --------
     >>> limit_value("columns"), limit_value("columns", {"columns": 5e4})
-    (20000, 50000.0)
+    (30000, 50000.0)
     """
     return (given or {}).get(name, LIMITS[name].value)
 
@@ -114,7 +121,7 @@ def describe_limit(name: str, needed: float, given: Mapping[str, float] | None =
     Examples
     --------
     >>> describe_limit("columns", 99_999)
-    'the limit is 20000 columns, and --limit columns=1e+05 lifts it'
+    'the limit is 3e+04 columns, and --limit columns=1e+05 lifts it'
     """
     allowed = limit_value(name, given)
     return f"the limit is {allowed:.4g} {LIMITS[name].unit}, and --limit {name}={_round_up(needed)} lifts it"
@@ -183,6 +190,21 @@ def check_stored(path: Path, rows: int, columns: int, given: Mapping[str, float]
         raise FormatError(
             f"{path.name}: it claims {rows:.4g} samples in each of {columns} columns, but holds {present:,} bytes: nearly all of them "
             f"were never written. Copy it again, or cut it to what was recorded; {describe_limit('stored_samples', claimed, given)}"
+        )
+
+
+def check_columns(path: Path, columns: int, given: Mapping[str, float] | None = None) -> None:
+    """Refuse a table of absurdly many columns.
+
+    Raises
+    ------
+    FormatError
+        With their number, and the option that lifts the limit.
+    """
+    if columns > limit_value("columns", given):
+        raise FormatError(
+            f"{path.name}: it has {columns:,} columns; is the separator another one, or is the table transposed? Write a file of the "
+            f"columns that are needed; {describe_limit('columns', columns, given)}"
         )
 
 

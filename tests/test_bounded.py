@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -270,3 +271,46 @@ def test_flipped_bytes_in_a_classic_header_take_no_memory(tmp_path: Path) -> Non
 
         assert peak_of(read) < 2**24
     assert refused > 20
+
+
+def write_wide_csv(path: Path, header: str, columns: int) -> Path:
+    """A text log of one axis, with very many further columns."""
+    names = ["time [s]", "gyro_x [deg/h]", *(header.format(number) for number in range(columns))]
+    rows = (",".join([f"{row / 100}", "2.5", *["1.5"] * columns]) for row in range(6))
+    path.write_text("\n".join([",".join(names), *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(("header", "kept"), [("c{} [V]", 200), ("c{}", 0), ("c", 0)])
+def test_table_of_20_000_columns_is_read_for_those_that_are_used(header: str, kept: int, tmp_path: Path) -> None:
+    path = write_wide_csv(tmp_path / "log.csv", header, 20_000)
+    begun = time.process_time()
+    raw = read_log(path)
+    assert time.process_time() - begun < 10.0  # above two minutes before
+    assert len(raw.data_vars) == 1 + kept
+    np.testing.assert_array_equal(raw["rate"], np.full((1, 6), 2.5))
+    assert any("left out" in note for note in raw.attrs["notes"])
+    if kept:
+        assert any("the limit is 200 channels, and --limit channels=2e+04 lifts it" in note for note in raw.attrs["notes"])
+
+
+def test_limit_of_channels_is_lifted_by_its_option(tmp_path: Path) -> None:
+    path = write_wide_csv(tmp_path / "log.csv", "c{} [V]", 5)
+    assert len(read_log(path, limits={"channels": 2}).data_vars) == 3
+    mapped = read_log(path, limits={"channels": 2}, map={"c4": "c4"})
+    assert set(mapped.data_vars) == {"rate", "c0", "c1", "c4"}
+
+
+@pytest.mark.parametrize("header", ["c", "gyro_x [deg/h]", "c{}"])
+def test_table_of_100_000_columns_is_refused_at_once(header: str, tmp_path: Path) -> None:
+    path = write_wide_csv(tmp_path / "log.csv", header, 100_000)
+    begun = time.process_time()
+    with pytest.raises(FormatError, match=r"it has 100,002 columns.* the limit is 3e\+04 columns, and --limit columns=1.1e\+05 lifts it"):
+        read_log(path)
+    assert time.process_time() - begun < 10.0
+
+
+def test_line_of_a_wide_table_is_longer_than_the_usual_head(tmp_path: Path) -> None:
+    path = write_wide_csv(tmp_path / "log.csv", "a_long_name_of_a_channel_{}", 9000)
+    assert path.read_text().index("\n") > 2**17
+    assert read_log(path).sizes["row"] == 6

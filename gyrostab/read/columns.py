@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
+from gyrostab.limits import check_columns, describe_limit, limit_value
 from gyrostab.read.headers import (
     AXIS,
     KNOWN,
@@ -121,8 +122,14 @@ def plan_columns(
     Returns
     -------
     Plan
-        Nothing is raised here; ``Plan.check()`` raises what is wrong.
+        ``Plan.check()`` raises what is wrong.
+
+    Raises
+    ------
+    FormatError
+        When there are more columns than the limit allows.
     """
+    check_columns(path, len(headers), options.limits)
     preset = _known_program(path, headers, above, is_filled)
     work = _Work(path, options, rising or (lambda source: True))
     named = work.name(headers, units or {}, calendars or {}, frozenset(stamped), {**(coded or {}), **preset.columns})
@@ -131,7 +138,7 @@ def plan_columns(
     rest = [column for column in named if column is not time]
     gyro = [column for column in rest if AXIS.match(column.low)]
     signal, kind = work.plan_gyro(gyro, headers)
-    work.plan_channels([column for column in rest if column not in gyro])
+    work.plan_channels([column for column in rest if not AXIS.match(column.low)])
     rate = preset.rate if time is None and options.rate is None else None
     if preset.name:
         told = f", and {rate:g} Hz by the lines above the header" if rate else ""
@@ -167,6 +174,8 @@ class _Work:
         self.notes: list[str] = []
         self.problems: list[GyrostabError] = []
         self.left_out: list[str] = []
+        self.surplus: list[str] = []
+        self.kept_channels = 0
         self.unitless: list[tuple[str, str | None, str]] = []  # name, quantity, header
         self.used_map: set[str] = set()
         self.used_units: set[str] = set()
@@ -251,13 +260,15 @@ class _Work:
             return None
         found.sort(key=lambda c: not self.rising(c.source))
         column = found[0]
-        others = found[1:] + [c for c in named if c not in found and c.low == "time"]
+        candidates = {id(c) for c in found}
+        others = found[1:] + [c for c in named if id(c) not in candidates and c.low == "time"]
         if others:
             names = " and ".join(repr(c.header) for c in [column, *others][:3])
             self.notes.append(f'{names} look like the time; {column.header!r} is used (for another: --map "{others[0].key}=time")')
             for other in others:
                 self._leave_out(other)
-                named.remove(other)
+            dropped = {id(other) for other in others}
+            named[:] = [c for c in named if id(c) not in dropped]
         unit = None if column.stamped else self._time_unit(column)
         self.columns.append(Column(column.source, column.header, "time", "time", "time", "ns", time_unit=unit))
         self._summarise(column, "time", "time", "time", unit.text if unit else "ISO 8601" if column.stamped else None)
@@ -383,6 +394,10 @@ class _Work:
             if text is None and asked:
                 message = f"{self.path.name}: column {column.header!r} carries no unit; give it with --unit {name}={example_unit(quantity)}"
                 self.problems.append(MissingUnitError(f'{message}, or drop the column with --map "{column.key}=-"'))
+            if text is not None and not (known or asked) and self.kept_channels >= limit_value("channels", self.options.limits):
+                self.surplus.append(column.header)
+                self._leave_out(column)
+                continue
             if text is None:
                 self.unitless.append((name, quantity, column.header))
                 self._leave_out(column)
@@ -410,6 +425,7 @@ class _Work:
                 self.problems.append(UnitError(f"{self.path.name}: {message}; {fix}"))
             else:
                 quantity = None
+        self.kept_channels += 1
         self.columns.append(Column(column.source, column.header, "channel", name, quantity or "other", units, factor, offset))
         self._summarise(column, name, "channel", quantity or "other", text)
 
@@ -444,6 +460,10 @@ class _Work:
             name, quantity, _ = min(self.unitless, key=lambda entry: entry[1] is None)  # one of a known quantity first
             how = f"keep one with a unit: --unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
             self.notes.append(f"left out, as they carry no unit: {_listing([header for _, _, header in self.unitless])} ({how})")
+        if self.surplus:
+            needed = self.kept_channels + len(self.surplus)
+            how = f"map those that are needed (--map NAME=NAME); {describe_limit('channels', needed, self.options.limits)}"
+            self.notes.append(f"left out, as there are more channels than a log keeps: {_listing(self.surplus, 5)} ({how})")
         if self.left_out:
             self.notes.append(f"left out, as the file is read for its channels: {_listing(self.left_out)}")
         place = {header.strip(): index for index, header in enumerate(headers)}

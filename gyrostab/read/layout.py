@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 from gyrostab.errors import FormatError
+from gyrostab.limits import check_columns
 from gyrostab.read.stamps import looks_iso
 
 __all__ = ["BLANK", "Layout", "find_layout", "is_number", "is_text", "split_line"]
@@ -67,7 +69,7 @@ def split_line(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in line.split(separator)]
 
 
-def find_layout(path: Path, head: bytes, *, complete: bool) -> Layout:
+def find_layout(path: Path, head: bytes, *, complete: bool, limits: Mapping[str, float] | None = None) -> Layout:
     """Find the layout of a text log in its first bytes.
 
     Parameters
@@ -78,17 +80,20 @@ def find_layout(path: Path, head: bytes, *, complete: bool) -> Layout:
         The beginning of the file, decompressed.
     complete : bool
         Whether `head` is the whole file.
+    limits : mapping of str to float, optional
+        Limits that the user set.
 
     Raises
     ------
     FormatError
-        When the file is empty, is not text, or has no data rows.
+        When the file is empty, is not text, has no data rows, or has more columns than the limit allows.
     """
     lines, notes = _decode(path, head, complete=complete)
     filled = (index for index, line in enumerate(lines) if line.strip() and not _COMMENT.match(line))
     content = list(islice(filled, MOST_LINES))
     if not content:
         raise FormatError(f"{path.name}: there is no row of data, only {len(lines)} blank or comment lines; copy it again")
+    check_columns(path, 1 + max(lines[index].count(mark) for index in content for mark in "\t;,"), limits)
     header, separator, above, first = _find_header(path, lines, content)
     offset = sum(len(line) for line in head.splitlines(keepends=True)[:first])
     data = [lines[index] for index in content if index >= first]

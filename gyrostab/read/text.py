@@ -34,7 +34,8 @@ from gyrostab.threads import in_order
 __all__ = ["matches", "read", "scan"]
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
-HEAD_BYTES = 2**18
+#: Bytes of the file in which the layout is looked for; more, up to the second number, where they hold fewer lines than the third.
+HEAD_BYTES, MOST_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
 PIECE_BYTES = 2**18
 LINE_BYTES = 2**8
@@ -87,8 +88,11 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES, stop: Ca
 
 def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
     with _open(path) as file:
-        head = _chunk(path, file, HEAD_BYTES, 0)
-        layout = find_layout(path, head, complete=len(head) < HEAD_BYTES)
+        size, head = HEAD_BYTES, _chunk(path, file, HEAD_BYTES, 0)
+        while len(head) == size and size < MOST_HEAD_BYTES and head.count(b"\n") < HEAD_LINES:  # lines of very many cells
+            head += _chunk(path, file, size, size)
+            size *= 2
+        layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
     stamped = [
         column for column in range(layout.width) if any(looks_iso(row[column]) for row in layout.samples if len(row) == layout.width)
     ]
