@@ -105,6 +105,7 @@ def content() -> dict[str, Any]:
         "mismatches": mismatches,
         "effects": effects,
         "unexplained": [],
+        "unused_channels": [{"name": "humidity", "reason": "no effect follows a channel of this name"}],
         "not_found": {
             "shupe": {"upper_limit": None, "unit": None, "reason": "not identifiable: there is no temperature channel"},
             "spectral_line": {"upper_limit": 0.05, "unit": "deg/h", "reason": "below limit"},

@@ -23,6 +23,7 @@ from gyrostab.diagnose.modelling.expected_effects import expected_baseline, with
 from gyrostab.diagnose.modelling.recalibrate import without_hops
 from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
 from gyrostab.diagnose.naming.name import name_effects
+from gyrostab.diagnose.reduction.aligned import align_channels
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.task import Compared, Task, still_lines
 from gyrostab.errors import OptionError, SchemaError
@@ -119,6 +120,7 @@ def _diagnose(
 ) -> Diagnosis:
     """One step after the other."""
     begun = time.perf_counter()
+    log = _with_aligned_channels(log)
     given = simulation if simulation is None or isinstance(simulation, xr.Dataset | Model) else read_model(simulation)
     if isinstance(given, xr.Dataset):
         _check_alike(log, given)
@@ -132,6 +134,14 @@ def _diagnose(
     compared = _beside_hops(task, _at_rest(task, _compare(task, *_calibrated(task, reduced))))
     progress("fitting", 0)
     return conclude(task, compared, begun)
+
+
+def _with_aligned_channels(log: xr.Dataset) -> xr.Dataset:
+    """Lay the channels on the grid of the gyro; those of no use go to the attribute ``unused_channels``."""
+    aligned = align_channels(log)
+    for note in aligned.notes:
+        warnings.warn(note, stacklevel=5)
+    return aligned.log.assign_attrs(unused_channels=aligned.unused)
 
 
 def _compare(task: Task, reduced: xr.Dataset, baseline: xr.Dataset) -> Compared:

@@ -117,12 +117,18 @@ def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Span (UTC)", f"{_stamp(recording['start'])} to {_stamp(recording['end'])}, {length_text(float(length))}"),
         ("Axes, sampling rate", f"{', '.join(recording['axes'])} at {recording['sampling_rate_hz']:g} Hz"),
         ("Channels", ", ".join(recording["channels"]) or "none"),
+        *([("Channels not used", _unused_text(content))] if content.get("unused_channels") else []),
         ("Missing samples", f"{100.0 * recording['missing_share']:.2g} %"),
         ("Simulation compared with", _source_text(baseline)),
         *([("Expected, with the size it has here", expected)] if expected else []),
         *([("Quiet stretches (UTC)", spans + (f" and {more} more" if more > 0 else ""))] if spans else []),
         ("Time taken", f"{content['seconds']:.3g} s"),
     ]
+
+
+def _unused_text(content: Mapping[str, Any]) -> str:
+    """List the channels that took no part, each with the reason."""
+    return "; ".join(f"{one['name']}: {one['reason']}" for one in content["unused_channels"])
 
 
 def _source_text(baseline: Mapping[str, Any]) -> str:

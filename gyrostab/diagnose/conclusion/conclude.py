@@ -29,6 +29,7 @@ from gyrostab.diagnose.conclusion.gate import with_supported_claims
 from gyrostab.diagnose.conclusion.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
 from gyrostab.diagnose.conclusion.surfaces import make_surfaces
 from gyrostab.diagnose.conclusion.verdict import decide_verdict
+from gyrostab.diagnose.effects.channel_use import unused_channels
 from gyrostab.diagnose.effects.explained import without_odd
 from gyrostab.diagnose.modelling.expected_effects import expected_baseline, fit_expected
 from gyrostab.diagnose.modelling.limits import limits
@@ -84,6 +85,7 @@ def conclude(task: Task, compared: Compared, begun: float) -> Diagnosis:
         "effects": effect_tables(fit.fitted, reduced),
         "unexplained": unexplained,
         "not_found": limit_tables(limits(fit.naming)),
+        "unused_channels": unused_channels(reduced, _used_channels(fit.naming)),
         "held_out": {name: held[name] for name in HELD_OUT},
         "seconds": round(time.perf_counter() - begun, 3),
     }
@@ -91,6 +93,11 @@ def conclude(task: Task, compared: Compared, begun: float) -> Diagnosis:
     diagnosis = Diagnosis(plain(content), _surfaces(reduced, fit, before, after), model_tables(fit.noise, fit.fitted, own))
     check_diagnosis(diagnosis.content)
     return diagnosis
+
+
+def _used_channels(naming: Naming) -> set[str]:
+    """Channels that some effect could follow, or was compared with."""
+    return {name for one in naming.candidates for name in (*one.driver, *one.witness)}
 
 
 def fit_supported(naming: Naming, baseline: xr.Dataset) -> tuple[Naming, list[Fitted], Fit]:

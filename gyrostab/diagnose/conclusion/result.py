@@ -70,6 +70,7 @@ class Diagnosis:
             lines.append(f"  predicts time kept apart better by {gain['nats']:.3g} nats; chance reaches {gain['threshold']:.2g}")
             if step := next_measurement(effect["name"], effect["alternatives"]):
                 lines.append(f"  {step}")
+        lines += [f"- channel {one['name']} is not used: {one['reason']}" for one in self.content.get("unused_channels", [])]
         left = set(self.content["unexplained"])
         boxes = [box for box in self.mismatches if box["id"] in left]
         lines += [f"- unexplained: {without_chance(box['statement']) if len(boxes) > 1 else box['statement']}" for box in boxes]
@@ -112,6 +113,7 @@ _FIELDS: dict[str, dict[str, Any]] = {
         "schema": str, "recording": dict, "baseline": dict, "verdict": str, "false_alarm_level": _NUMBER, "mismatches": list,
         "effects": list, "unexplained": list, "not_found": dict, "held_out": dict, "seconds": _NUMBER,
     },
+    "unused_channel": {"name": str, "reason": str},
     "recording": {
         "files": list, "axes": list, "start": str, "end": str, "sampling_rate_hz": _NUMBER, "channels": list, "missing_share": _NUMBER,
     },
@@ -191,6 +193,8 @@ def check_diagnosis(content: Mapping[str, Any]) -> None:
         _check_effect(effect, f"effects[{place}]")
     for name, entry in content["not_found"].items():
         _require(entry, "not_found", f"not_found.{name}")
+    for place, channel in enumerate(content.get("unused_channels", [])):
+        _require(channel, "unused_channel", f"unused_channels[{place}]")
     stray = [number for number in content["unexplained"] if number not in numbers]
     if stray:
         raise SchemaError(f"diagnosis: unexplained names the mismatch {stray[0]}, which is not there")

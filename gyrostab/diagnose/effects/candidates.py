@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.effects.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
 from gyrostab.diagnose.effects.designs import BUILDERS, Candidate, Variant, term_density
 from gyrostab.diagnose.effects.instants import known_instants, tried_instants
 from gyrostab.diagnose.gains.tallies import OF_LATTICE, coarse_lattice
@@ -41,7 +42,6 @@ _MOST_VALUES, _MOST_VARIANTS = 60, 200
 LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
 _SEEN = 3.0  # standard errors that an effect of the largest size must have to be looked for
 _INSTANT = "at"  # nuisance parameter that is an instant
-_LEAST_SHARE = 0.5  # of the blocks in which a channel must have data
 _TWINS = {"fringe_hop": "bias_jump"}  # the same design: the size decides
 _SAME = 1e-3  # designs that differ by less of their size are one
 
@@ -187,7 +187,7 @@ def _matches(channel: str, unit: str, channels: tuple[str, ...], reduced: xr.Dat
     else:
         base = channel.rstrip("0123456789").rstrip("_")
         names = sorted((name for name in units if name == base or name.startswith(base + "_")), key=lambda name: (name != channel, name))
-    return [name for name in names if units.get(name) == unit and np.isfinite(reduced[f"channel_{name}"].values).mean() >= _LEAST_SHARE]
+    return [name for name in names if units.get(name) == unit and np.isfinite(reduced[f"channel_{name}"].values).mean() >= MIN_BLOCK_SHARE]
 
 
 # -------------------------------------------------------------------------------------------------------------- variants
@@ -196,7 +196,7 @@ def _matches(channel: str, unit: str, channels: tuple[str, ...], reduced: xr.Dat
 def _of_kind(kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray) -> tuple[list[Candidate], str]:
     """Candidates of one effect with its channels, by view; and why there are none."""
     if kind.channels and not drivers:
-        return _strangers(kind, reduced), f"the recording has no channel {' or '.join(kind.channels)}"
+        return _strangers(kind, reduced), missing_channel_reason(tuple(kind.channels), reduced)
     windows = windows_of(reduced, drivers)
     predictions: list[tuple[dict[str, Any], Prediction]] = []
     why = ""
@@ -205,7 +205,7 @@ def _of_kind(kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], c
             effect = kind.example(**values)
             predictions.append((values, _visible(kind.name, _exogenous(effect, windows), reduced, coefficient)))
         except KeyError as error:
-            why = f"the recording has no channel {error.args[0]}"
+            why = missing_channel_reason((str(error.args[0]),), reduced)
         except OptionError as error:
             why = str(error)
     driver = tuple(drivers.get(channel, "") for channel in kind.channels) if drivers else ()

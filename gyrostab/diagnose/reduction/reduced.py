@@ -438,6 +438,7 @@ def _attributes(work: Accumulator, log: xr.Dataset, present: NDArray[np.int64]) 
         "missing_share": 1.0 - float(present.sum()) / (present.size * work.length),
         "source_files": texts(log, "source_files"),
         "notes": texts(log, "notes"),
+        "unused_channels": dict(log.attrs.get("unused_channels", {})),
     }
 
 
