@@ -193,7 +193,10 @@ def check_diagnosis(content: Mapping[str, Any]) -> None:
         _check_effect(effect, f"effects[{place}]")
     for name, entry in content["not_found"].items():
         _require(entry, "not_found", f"not_found.{name}")
-    for place, channel in enumerate(content.get("unused_channels", [])):
+    unused = content.get("unused_channels", [])
+    if not isinstance(unused, list):
+        raise SchemaError(f"diagnosis: unused_channels is {unused!r}, which is no list")
+    for place, channel in enumerate(unused):
         _require(channel, "unused_channel", f"unused_channels[{place}]")
     stray = [number for number in content["unexplained"] if number not in numbers]
     if stray:
