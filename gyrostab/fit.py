@@ -21,7 +21,7 @@ from gyrostab.noise import LAWS, TERMS, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_surface
 from gyrostab.windows import duration_seconds, thin
 
-__all__ = ["fit_noise", "fit_part"]
+__all__ = ["fit_noise", "fit_part", "is_described", "refit"]
 
 #: Averaging times used at most; more of them share the same information and cost the cube of their number.
 MOST_TAUS = 48
@@ -38,7 +38,13 @@ _SEPARATION = 1e-4
 
 
 def fit_noise(
-    surface: xr.Dataset, *, terms: str | Iterable[str] = "QNBKR", method: str = "gls", tau_min: Any = None, tau_max: Any = None
+    surface: xr.Dataset,
+    *,
+    terms: str | Iterable[str] = "QNBKR",
+    method: str = "gls",
+    tau_min: Any = None,
+    tau_max: Any = None,
+    observed_only: bool = True,
 ) -> xr.Dataset:
     """Fit the five-term noise model to every window of a surface.
 
@@ -61,6 +67,9 @@ def fit_noise(
         deviations where variances add, gives no errors, and is there for comparison.
     tau_min, tau_max : float or str, optional
         Averaging times to fit [s], all by default. Start above what is no noise: a filter, a line, resets of the feedback.
+    observed_only : bool
+        Give a coefficient and its standard error only where the term is observed, and NaN elsewhere. With False they are
+        the non-negative least-squares estimates of every window: for the fitted curve, or to study the estimator.
 
     Returns
     -------
@@ -68,8 +77,8 @@ def fit_noise(
         The surface, and per ``(axis, time)``: ``Q`` [urad], ``N`` [deg/sqrt(h)], ``B`` [deg/h], ``K`` [deg/h^1.5],
         ``R`` [deg/h^2], ``*_stderr``, ``*_upper`` (95 % upper limit where the term is not observed),
         ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``; ``observable(axis, time, term)``: 0 the window
-        cannot see the term, 1 it gives an upper limit only, 2 the term is there (99 % one-sided). ``edf`` is that of the
-        fitted noise.
+        cannot see the term, 1 it gives an upper limit only, 2 the term is there (99 % one-sided). No term is observed in
+        a window that the five terms do not describe: see `is_described`. ``edf`` is that of the fitted noise.
 
     Raises
     ------
@@ -91,7 +100,59 @@ def fit_noise(
     >>> round(float(product.N.mean()), 3)
     0.01
     """
-    return _fit(surface, terms=terms, method=method, tau_min=tau_min, tau_max=tau_max)
+    return _fit(surface, terms=terms, method=method, tau_min=tau_min, tau_max=tau_max, observed_only=observed_only)
+
+
+def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
+    """Fit the windows of a product again, with the estimates of every term whether it is observed or not.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        What `fit_noise` returns, or some windows of it.
+    **options
+        Options of `fit_noise` that differ from those of the product.
+
+    Returns
+    -------
+    xarray.Dataset
+        As from ``fit_noise(..., observed_only=False)``: the coefficients of the fitted curve.
+
+    Examples
+    --------
+    >>> from gyrostab.davar import davar
+    >>> from gyrostab.log import make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(60_000), rate=100.0, unit="deg/h")
+    >>> product = fit_noise(davar(log, window="1min"), terms="NB")
+    >>> bool(product.B.isnull().any()), bool(refit(product).B.isnull().any())
+    (True, False)
+    """
+    kept = {"terms": "fit_terms", "method": "fit_method", "tau_min": "fit_tau_min_s", "tau_max": "fit_tau_max_s"}
+    own = {name: product.attrs[attribute] for name, attribute in kept.items() if attribute in product.attrs}
+    return fit_noise(product, **{**own, "observed_only": False, **options})
+
+
+def is_described(chi2: Any, dof: Any) -> Any:
+    """Tell whether the sum of the fitted terms describes a window.
+
+    Parameters
+    ----------
+    chi2, dof : array_like
+        ``fit_chi2`` and ``fit_dof`` of a product [1].
+
+    Returns
+    -------
+    ndarray of bool
+        False where noise that the terms describe would exceed `chi2` in fewer than one window of 1000; True where there
+        is no degree of freedom to tell.
+
+    Examples
+    --------
+    >>> is_described([20.0, 900.0, np.nan], [16.0, 16.0, 0.0])
+    array([ True, False,  True])
+    """
+    chi2, dof = np.nan_to_num(np.asarray(chi2, np.float64)), np.nan_to_num(np.asarray(dof, np.float64))
+    return ~((dof > 0) & (gammaincc(np.maximum(dof, 1.0) / 2.0, chi2 / 2.0) < _MISFIT))
 
 
 def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
@@ -128,6 +189,7 @@ def _fit(
     method: str = "gls",
     tau_min: Any = None,
     tau_max: Any = None,
+    observed_only: bool = True,
     here: bool = False,
 ) -> xr.Dataset:
     check_surface(surface)
@@ -139,7 +201,12 @@ def _fit(
         raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
     allowed = sum(1 << TERMS.index(term) for term in wanted)
     chosen = _within(surface["tau"].values, tau_min, tau_max)
-    return _fit_gls(surface, allowed, chosen, here=here) if method == "gls" else _fit_adev(surface, wanted, chosen)
+    if method == "gls":
+        product = _fit_gls(surface, allowed, chosen, here=here, observed_only=observed_only)
+    else:
+        product = _fit_adev(surface, wanted, chosen)
+    tau = surface["tau"].values[chosen]
+    return product.assign_attrs(fit_method=method, fit_terms="".join(wanted), fit_tau_min_s=tau[0], fit_tau_max_s=tau[-1])
 
 
 def _within(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
@@ -169,7 +236,9 @@ def _inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, i
     return [surface[name].data for name in names], ks, rate, window
 
 
-def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool) -> xr.Dataset:
+def _fit_gls(
+    surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool, observed_only: bool
+) -> xr.Dataset:
     cells, ks, rate, window = _inputs(surface)
     chosen = within[_choose(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
@@ -177,7 +246,7 @@ def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, he
 
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = [np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64) for a in arrays]
-        return _fit_block(flat, tables, allowed).reshape(arrays[0].shape[0], arrays[0].shape[1], -1)
+        return _fit_block(flat, tables, allowed, observed_only).reshape(arrays[0].shape[0], arrays[0].shape[1], -1)
 
     if here:
         fitted = block(*cells)
@@ -196,7 +265,7 @@ def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, he
     }
     if chosen.size == surface.sizes["tau"]:  # otherwise davar's own, for every averaging time, stands
         extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
-    return _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra, method="gls")
+    return _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
 
 
 class _Tables:
@@ -213,7 +282,6 @@ class _Tables:
         self.own_dof = np.vstack([2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)])
         self.ks = ks.astype(np.float64)
         self.quantile = _quantile_curve(0.05)
-        self.unlikely = _quantile_curve(_MISFIT)
 
 
 def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
@@ -240,7 +308,9 @@ def _choose(ks: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.unique(np.abs(np.log(ks)[:, None] - np.log(wanted)[None, :]).argmin(axis=0))
 
 
-def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -> NDArray[np.float64]:
+def _fit_block(
+    flat: list[NDArray[np.float64]], tables: _Tables, allowed: int, observed_only: bool
+) -> NDArray[np.float64]:
     """Coefficients, errors, limits, observability (n_terms each), chi2, dof and edf of each window, side by side."""
     result, misfit, dof = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
@@ -253,13 +323,12 @@ def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -
         visible = np.isfinite(square) & (field["separation"] > _SEPARATION)
         observed = visible & (square > 0) & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
         limit = np.minimum(_limit_of_estimate(field, tables), _limit_of_cell(flat, square, dof, tables))
-        failing = [cell[fails] for cell in flat], square[fails], dof[fails], tables
-        limit[fails] = _limit_of_curve(*failing, tables.quantile)
-        observed[fails] &= square[fails] <= _limit_of_curve(*failing, tables.unlikely)
+        limit[fails] = _limit_of_curve([cell[fails] for cell in flat], square[fails], dof[fails], tables)
+        observed &= ~fails[:, None]
         upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
-        stderr = np.where(fails[:, None] & ~observed, np.fmax(stderr, (upper - value) / _LIMIT), stderr)
-    stderr = np.where(visible, stderr, np.nan)
-    value = np.where(visible, value, np.nan)
+    given = observed if observed_only else visible
+    stderr = np.where(given, stderr, np.nan)
+    value = np.where(given, value, np.nan)
     observable = np.where(observed, 2.0, np.where(visible & np.isfinite(upper), 1.0, 0.0))
     return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
 
@@ -267,7 +336,7 @@ def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int) -
 def _widen(field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Say which windows the model does not fit, and multiply their variances in `field` by chi-square over its degrees of freedom."""
     chi2, dof = misfit.T
-    fails = (dof > 0) & (gammaincc(np.maximum(dof, 1.0) / 2.0, np.nan_to_num(chi2) / 2.0) < _MISFIT)
+    fails = ~is_described(chi2, dof)
     wider = np.where(fails, chi2 / np.maximum(dof, 1.0), 1.0)[:, None]
     field["square_stderr"] *= np.sqrt(wider)
     for name in ("variance_null", "variance_linear", "variance_square"):
@@ -304,9 +373,8 @@ def _limit_of_curve(
     square: NDArray[np.float64],
     dof: NDArray[np.float64],
     tables: _Tables,
-    quantile: tuple[float, float, NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Upper limit of a squared coefficient that needs no model: its part of the curve cannot be more than the whole.
+    """95 % upper limit of a squared coefficient that needs no model: its part of the curve cannot be more than the whole.
 
     What else is in a cell, noise or not, only adds to it. What takes away is a filter, or an alias that looks like a
     filtered noise, and that bends the curve at short averaging times; so the cells are those of the last decade.
@@ -315,7 +383,7 @@ def _limit_of_curve(
     span = np.array([np.inf, *[_DECADE] * (len(TERMS) - 1)])
     own_dof = np.vstack([tables.own_dof[:STOCHASTIC], tables.own_dof[:STOCHASTIC].min(axis=0)])
     square = np.ascontiguousarray(square)
-    return np.asarray(cell_limits(*flat, square, dof, tables.columns, own_dof, tables.ks, span, _MOST_FREEDOM, *quantile))
+    return np.asarray(cell_limits(*flat, square, dof, tables.columns, own_dof, tables.ks, span, _MOST_FREEDOM, *tables.quantile))
 
 
 def _assemble(
@@ -326,7 +394,6 @@ def _assemble(
     observable: list[Any],
     *,
     extra: dict[str, Any],
-    method: str,
 ) -> xr.Dataset:
     plane = ("axis", "time")
     out: dict[str, Any] = {}
@@ -338,9 +405,7 @@ def _assemble(
             out[f"{symbol}_squared"] = (plane, value**2, attributes(f"{symbol}_squared"))
     stack = da.stack if isinstance(observable[0], da.Array) else np.stack
     out["observable"] = ((*plane, "term"), stack(observable, axis=-1).astype(np.int8), attributes("observable"))
-    product = surface.assign({**out, **extra, "term": ("term", list(TERMS), attributes("term"))})
-    product.attrs["fit_method"] = method
-    return product
+    return surface.assign({**out, **extra, "term": ("term", list(TERMS), attributes("term"))})
 
 
 _SQUARED = ("N_squared", "K_squared")
@@ -362,4 +427,4 @@ def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64])
     seen = [np.where(np.isfinite(values[..., i]), 2, 0) for i in range(len(TERMS))]
     extra = {name: (("axis", "time"), nothing[0], attributes(name)) for name in ("fit_chi2", "fit_dof")}
     coefficients = [values[..., i] for i in range(len(TERMS))]
-    return _assemble(surface, coefficients, nothing, nothing, seen, extra=extra, method="adev")
+    return _assemble(surface, coefficients, nothing, nothing, seen, extra=extra)

@@ -75,6 +75,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
     },
     "ramp_response": {"long_name": "Allan variance of a rate ramp seen through the gaps, as a share of the gap-free law", "units": "1"},
     "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
+    "outlier_count": {"long_name": "single samples of the window that stand far from both neighbours", "units": "1"},
     "window_coverage": {"long_name": "share of the window's samples that are present", "units": "1"},
     "observable": {"long_name": "what the window can tell of the noise term", **_flags(OBSERVABLE)},
     "fit_chi2": {"long_name": "misfit of the five-term model, generalised least squares chi-square", "units": "1"},

@@ -19,6 +19,7 @@ from gyrostab.davar.plan import MOST_CELLS, Plan, last_sample, make_plan, units_
 from gyrostab.errors import OptionError
 from gyrostab.kernels.covariance import diagonal_products
 from gyrostab.kernels.least_squares import identify_noise
+from gyrostab.kernels.outlier_count import count_outliers
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_theta
 from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
@@ -31,6 +32,8 @@ from gyrostab.timegrid import first_stamp, grid_times
 
 __all__ = ["davar", "davar_part", "davar_parts"]
 
+#: Variables by axis and window, in the order of the arrays that `_work` returns.
+_PLANE_FIELDS = ("window_mean", "window_coverage", "outlier_count")
 #: Samples of a part up to which all its axes are read together.
 _TOGETHER = 2**21
 #: Parts at least of a surface of so many units of work, for the threads to share.
@@ -98,7 +101,7 @@ def davar(
     -------
     xarray.Dataset
         ``avar, count, coverage, edf, estimator, white_response, quantization_response, ramp_response (axis, time, tau)``,
-        ``window_mean, window_coverage (axis, time)``, and every channel of the log averaged over each window; ``time`` is
+        ``window_mean, window_coverage, outlier_count (axis, time)``, and every channel of the log averaged over each window; ``time`` is
         the centre of the window, with ``time_bounds``; ``tau`` [s]. Units stand on the variables.
 
     Raises
@@ -247,17 +250,18 @@ def _stretches(data: Any, spans: Sequence[tuple[int, int]], space: Workspace) ->
 def _work(
     x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...], space: Workspace | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cells (9, n_windows, n_tau), the last field the degrees of freedom, and means (2, n_windows) of one unit."""
+    """Cells (9, n_windows, n_tau), the last field the degrees of freedom, and plane fields (3, n_windows) of one unit."""
     x = np.ascontiguousarray(x)
     if x.dtype.kind == "f" and np.isnan(x[[0, x.size // 2, -1]]).all() and np.isnan(x).all():
         cells, means = (part.copy() for part in _empty_surface(_hashable(unit), x.size))
     else:
         cells, means = surface_unit(x, unit, space)
+    outliers = count_outliers(x, np.arange(means.shape[1]) * unit.step, unit.window)
     scale = HOUR if unit.angle else 1.0  # angles are in degree, so their slopes in degree per second
     cells[0] *= scale**2
     dof = identify_noise(cells[0], cells[5], cells[6], cells[7], cells[3], *tables)
     means[0] *= scale
-    return np.concatenate([cells, dof[None]]), means
+    return np.concatenate([cells, dof[None]]), np.concatenate([means, outliers[None]])
 
 
 def _kept_tables(plan: Plan) -> tuple[Any, ...]:
@@ -295,7 +299,7 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
 
 
 def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
-    """Run the units of work: cells (9, axis, time, tau) and means (2, axis, time), dask if `data` is."""
+    """Run the units of work: cells (9, axis, time, tau) and plane fields (3, axis, time), dask if `data` is."""
     lazy = isinstance(data, da.Array)
     tables = _noise_tables(unit, rate)
     shared = dask.delayed(tables, pure=True, traverse=False) if lazy else tables
@@ -307,7 +311,7 @@ def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
             n = windows.stop - windows.start
             one_cells, one_means = work(data[row, windows.start * unit.step : last_sample(windows, unit)], unit, shared)
             cells.append(da.from_delayed(one_cells, (len(CELL_FIELDS) + 1, n, unit.ks.size), dtype=np.float64))
-            means.append(da.from_delayed(one_means, (2, n), dtype=np.float64))
+            means.append(da.from_delayed(one_means, (len(_PLANE_FIELDS), n), dtype=np.float64))
         rows_cells.append(da.concatenate(cells, axis=1))
         rows_means.append(da.concatenate(means, axis=1))
     stacked = da.stack(rows_cells, axis=1), da.stack(rows_means, axis=1)
@@ -317,7 +321,7 @@ def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
 
 
 def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool) -> tuple[Any, Any]:
-    """The published algorithms, eager: cells (9, axis, time, tau) and means (2, axis, time)."""
+    """The published algorithms, eager: cells (9, axis, time, tau) and plane fields (3, axis, time)."""
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
     n_windows = (all_points - points) // unit.step + (0 if paper else 1)
@@ -327,7 +331,7 @@ def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, pa
     tables = _noise_tables(unit, rate)
     full = (points - 2 * unit.ks).astype(np.float64)
     cells = np.zeros((len(CELL_FIELDS) + 1, signal.sizes["axis"], n_windows, unit.ks.size))
-    means = np.zeros((2, signal.sizes["axis"], n_windows))
+    means = np.zeros((len(_PLANE_FIELDS), signal.sizes["axis"], n_windows))
     for row in range(signal.sizes["axis"]):
         x = np.asarray(signal.isel(axis=row).data)
         theta, present, missing = reference_theta(x, angle=unit.angle, paper=paper)
@@ -341,7 +345,8 @@ def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, pa
         if not unit.zero_fill:
             cells[0, row][cells[2, row] < unit.min_coverage] = np.nan
         cells[8, row] = identify_noise(cells[0, row], cells[5, row], cells[6, row], cells[7, row], cells[3, row], *tables)
-        means[:, row] = window_means(x, unit)[:, :n_windows]
+        means[:2, row] = window_means(x, unit)[:, :n_windows]
+        means[2, row] = count_outliers(x, np.arange(n_windows) * unit.step, unit.window)
         means[0, row] *= HOUR if unit.angle else 1.0
     return cells, means
 
@@ -354,14 +359,14 @@ def _label(cells: Any, means: Any, log: xr.Dataset, plan: Plan, *, part: slice |
     bounds = np.stack([grid_times(start, rate, first), grid_times(start, rate, first + unit.window)], axis=-1)
     centre = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     names = (*CELL_FIELDS, "edf")
-    integers = {"count": np.int64, "estimator": np.int8}
+    integers = {"count": np.int64, "estimator": np.int8, "outlier_count": np.int64}
     variables: dict[str, Any] = {
         name: (cube, cells[i].astype(integers[name]) if name in integers else cells[i], attributes(name))
         for i, name in enumerate(names)
         if name != "gap_factor"
     }
-    variables["window_mean"] = (plane, means[0], attributes("window_mean"))
-    variables["window_coverage"] = (plane, means[1], attributes("window_coverage"))
+    for name, values in zip(_PLANE_FIELDS, means, strict=True):
+        variables[name] = (plane, values.astype(integers.get(name, np.float64)), attributes(name))
     # The share of degrees of freedom that the gaps leave is what a fit needs beside the responses.
     variables["gap_factor"] = (cube, cells[CELL_FIELDS.index("gap_factor")], attributes("gap_factor"))
     groups = units_of_work(signal.sizes["time"], unit)

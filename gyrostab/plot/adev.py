@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
+from gyrostab.fit import is_described, refit
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import COLOURS, axis_names, axis_style, literal_text, new_figure, stack_panels
 from gyrostab.schema import OBSERVABLE, check_surface
@@ -47,7 +48,8 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     """
     check_surface(product)
     (name,) = axis_names(product, axis)
-    window = product.sel(axis=name).isel(time=_window(product.sel(axis=name), when)).compute()
+    windows = product.sel(axis=[name]).isel(time=[_window(product.sel(axis=name), when)]).compute()
+    window = windows.isel(axis=0, time=0)
     tau = window["tau"].values
     figure = new_figure(8.0, 5.8, stacked=True)
     panel = figure.subplots()
@@ -57,7 +59,8 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     deviation = np.sqrt(window["avar"].values)
     panel.plot(tau, deviation, color=colour, marker="o", markersize=3.5, linewidth=1.2, label=f"axis {name}, measured")
     if "observable" in window:
-        _draw_terms(panel, window, [other for other in COLOURS if other != colour])
+        estimates = refit(windows).isel(axis=0, time=0)
+        _draw_terms(panel, window, estimates, [other for other in COLOURS if other != colour])
     panel.set_xscale("log")
     panel.set_yscale("log")
     shown = deviation[np.isfinite(deviation) & (deviation > 0)]
@@ -120,21 +123,31 @@ def _window(part: xr.Dataset, when: Any) -> int:
     return int(np.argmin(np.abs(time - stamp)))
 
 
-def _draw_terms(panel: Axes, window: xr.Dataset, colours: list[str]) -> None:
-    """Draw each observed term as a broken line, name the limits of the others, and draw the sum of all five as a black line."""
+def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours: list[str]) -> None:
+    """Draw the fitted curve as a black line and each observed term as a broken one; name the limits of the others."""
     tau = window["tau"].values
     total = np.zeros(tau.size)
     responses = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
     for number, (symbol, law) in enumerate(LAWS.items()):
         state = int(window["observable"].sel(term=symbol))
         value, error, upper = (float(window[f"{symbol}{end}"]) for end in ("", "_stderr", "_upper"))
-        term = law.avar(tau, value if np.isfinite(value) else 0.0)
+        term = law.avar(tau, np.nan_to_num(float(estimates[symbol])))
         seen = window[responses[symbol]].values if responses.get(symbol) in window else 1.0
-        total += term * np.where(np.isfinite(seen), seen, 1.0)
+        term = term * np.where(np.isfinite(seen), seen, 1.0)
+        total += term
         if state == _SEEN:
             label = f"{symbol} = {value:.3g} ± {error:.1g} {law.label} ({law.name})"
             panel.plot(tau, np.sqrt(term), linestyle=_DASHES[number], color=colours[number], linewidth=1.3, label=label)
         elif state == _LIMIT:
             panel.plot([], [], linestyle="none", label=f"{symbol} < {upper:.3g} {law.label} ({law.name})")
     if total.any():
-        panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label="sum of the five fitted terms")
+        panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label=_name_curve(window))
+
+
+def _name_curve(window: xr.Dataset) -> str:
+    """Name the fitted curve, with its misfit."""
+    chi2, dof = float(window["fit_chi2"]), float(window["fit_dof"])
+    if not dof > 0:
+        return "sum of the five fitted terms"
+    verdict = "" if is_described(chi2, dof) else ": the terms do not describe this window"
+    return f"sum of the fitted terms, χ²/dof = {chi2 / dof:.3g}{verdict}"

@@ -1,0 +1,297 @@
+"""What a product says of a whole record: each noise term, how well the terms describe it, and what disturbed it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.fit import is_described, refit
+from gyrostab.noise import LAWS
+from gyrostab.schema import OBSERVABLE, check_product
+
+__all__ = [
+    "FitSummary",
+    "TermSummary",
+    "find_fit_from",
+    "format_product",
+    "summarise_fit",
+    "summarise_terms",
+]
+
+_LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
+#: Windows, spread over the record, that are fitted again to find the averaging time from which the terms describe them.
+_TRIED_WINDOWS = 24
+#: A share of failing windows that is not worth a remark: a window that the terms do describe fails in 0.1 to 2 % of cases
+#: (docs/method.md), and in a record of few windows one of them is no evidence.
+_FAILING_SHARE = 0.05
+#: Least ratio of longest to shortest averaging time that tells five terms apart: below two decades of slope they merge.
+_LEAST_SPAN = 100.0
+#: Twice the rotation of the Earth, 15.041 deg/h: no change of attitude at rest moves the mean rate further.
+_MOST_AT_REST_DEG_H = 30.082
+
+
+@dataclass(frozen=True)
+class TermSummary:
+    """One noise term of one axis over all windows.
+
+    Attributes
+    ----------
+    axis, symbol, unit : str
+        Axis, symbol of IEEE Std 952, unit of the coefficient.
+    status : str
+        ``observed`` where at least as many windows observe the term as only bound it, else ``upper_limit_only``, and
+        ``not_observable`` where no window says anything.
+    median, low, high : float
+        Median and 5 % and 95 % quantiles over the windows that observe the term [unit]; NaN when there are none.
+    limit : float
+        Median of the upper limits over the windows that only bound it [unit]; NaN when there are none.
+    observed_share, limited_share : float
+        Shares of the windows [1].
+    """
+
+    axis: str
+    symbol: str
+    unit: str
+    status: Literal["observed", "upper_limit_only", "not_observable"]
+    median: float
+    low: float
+    high: float
+    limit: float
+    observed_share: float
+    limited_share: float
+
+    @property
+    def value(self) -> float:
+        """The median that `status` names [unit]; NaN when no window says anything."""
+        return {"observed": self.median, "upper_limit_only": self.limit}.get(self.status, np.nan)
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """How well the fitted terms describe the windows of one axis.
+
+    Attributes
+    ----------
+    axis : str
+        Axis.
+    windows : int
+        Windows with a fit.
+    chi2_per_dof : float
+        Median of ``fit_chi2 / fit_dof`` [1]; NaN without a fit.
+    failing_share : float
+        Share of the windows that the terms do not describe [1].
+    """
+
+    axis: str
+    windows: int
+    chi2_per_dof: float
+    failing_share: float
+
+    @property
+    def fails(self) -> bool:
+        """Whether more windows fail than chance explains."""
+        return self.failing_share > _FAILING_SHARE
+
+
+def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
+    """Summarise each noise term of each axis over the windows of a product.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of `gyrostab.fit_noise`, or some of its windows.
+
+    Returns
+    -------
+    list of TermSummary
+        Axis by axis, in the order Q, N, B, K, R.
+
+    Raises
+    ------
+    SchemaError
+        When it is no product.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)  # N = 0.01 deg/sqrt(h)
+    >>> product = fit_noise(davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min"))
+    >>> [(term.symbol, term.status, float(f"{term.value:.1g}")) for term in summarise_terms(product)][1]
+    ('N', 'observed', 0.01)
+    """
+    check_product(product)
+    return [
+        _summarise_term(product.sel(axis=axis), str(axis), symbol)
+        for axis in product["axis"].values
+        for symbol in LAWS
+    ]
+
+
+def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
+    state = part["observable"].sel(term=symbol).values
+    values = _finite(part[symbol].values[state == _SEEN])
+    limits = _finite(part[f"{symbol}_upper"].values[state == _LIMIT])
+    status: Literal["observed", "upper_limit_only", "not_observable"] = "not_observable"
+    if values.size >= max(limits.size, 1):
+        status = "observed"
+    elif limits.size:
+        status = "upper_limit_only"
+    low, median, high = np.quantile(values, [0.05, 0.5, 0.95]) if values.size else (np.nan,) * 3
+    limit = float(np.median(limits)) if limits.size else np.nan
+    shares = (number / max(state.size, 1) for number in (values.size, limits.size))
+    return TermSummary(axis, symbol, LAWS[symbol].label, status, float(median), float(low), float(high), limit, *shares)
+
+
+def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return values[np.isfinite(values)]
+
+
+def summarise_fit(product: xr.Dataset) -> list[FitSummary]:
+    """Say for each axis of a product how well the fitted terms describe its windows.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of `gyrostab.fit_noise`, or some of its windows.
+
+    Returns
+    -------
+    list of FitSummary
+        One per axis.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> noise = np.random.default_rng(1).standard_normal(60_000)
+    >>> product = fit_noise(davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min"))
+    >>> summarise_fit(product)[0].fails
+    False
+    """
+    check_product(product)
+    found = []
+    for axis in product["axis"].values:
+        chi2, dof = (product[name].sel(axis=axis).values for name in ("fit_chi2", "fit_dof"))
+        fitted = np.isfinite(chi2) & (dof > 0)
+        count = int(np.count_nonzero(fitted))
+        if count == 0:
+            found.append(FitSummary(str(axis), 0, np.nan, 0.0))
+            continue
+        ratio = float(np.median(chi2[fitted] / dof[fitted]))
+        failing = float(np.mean(~is_described(chi2[fitted], dof[fitted])))
+        found.append(FitSummary(str(axis), count, ratio, failing))
+    return found
+
+
+def find_fit_from(product: xr.Dataset) -> float | None:
+    """Find the shortest averaging time from which the fitted terms describe the windows of a product.
+
+    A filter, a line or motion bends the curve at short averaging times. Up to 24 windows, spread over the record, are
+    fitted again from each averaging time on, a factor of two apart.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of `gyrostab.fit_noise`, with its surface.
+
+    Returns
+    -------
+    float or None
+        Averaging time [s] for ``--fit-from`` (``tau_min`` of `gyrostab.fit_noise`); None when the terms describe the
+        product as it is, or when no averaging time leaves two decades to fit.
+    """
+    failing = [summary.axis for summary in summarise_fit(product) if summary.fails]
+    if not failing:
+        return None
+    count = product.sizes["time"]
+    tried = np.unique(np.linspace(0, count - 1, min(_TRIED_WINDOWS, count)).round().astype(int))
+    windows = product.sel(axis=failing).isel(time=tried).compute()
+    tau = windows["tau"].values
+    longest = float(product.attrs.get("fit_tau_max_s", tau[-1]))
+    shortest = 2.0 * float(product.attrs.get("fit_tau_min_s", tau[0]))
+    for start in tau[(tau >= shortest * (1 - 1e-9)) & (tau <= longest / _LEAST_SPAN)]:
+        if start < shortest * (1 - 1e-9):
+            continue
+        if not any(summary.fails for summary in summarise_fit(refit(windows, tau_min=float(start)))):
+            return float(start)
+        shortest = 2.0 * start
+    return None
+
+
+def format_product(product: xr.Dataset) -> str:
+    """Lay out a product as the text that ``gyrostab run`` prints.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of `gyrostab.fit_noise`.
+
+    Returns
+    -------
+    str
+        A table of the terms, and a line for each thing that was found: misfit, outliers, motion.
+    """
+    windows = product.sizes["time"]
+    lines = [f"Noise coefficients, median over {windows} window{'s' * (windows != 1)} (<: 95 % upper limit)", ""]
+    rows = [("axis", "term", "median", "5 % to 95 %", "unit", "observed in")]
+    for term in summarise_terms(product):
+        spread = f"{_number(term.low)} to {_number(term.high)}" if term.status == "observed" else ""
+        sign = "< " if term.status == "upper_limit_only" else ""
+        rows.append((term.axis, term.symbol, sign + _number(term.value), spread, term.unit, _share(term.observed_share)))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    return "\n".join([*lines, "", *_describe_misfit(product), *_describe_outliers(product), *_describe_motion(product)])
+
+
+def _number(value: float) -> str:
+    return f"{float(f'{value:.3g}'):g}" if np.isfinite(value) else "-"
+
+
+def _share(share: float) -> str:
+    return "all" if share == 1.0 else f"{share:.0%}"
+
+
+def _describe_misfit(product: xr.Dataset) -> list[str]:
+    fits = [summary for summary in summarise_fit(product) if summary.windows]
+    if not fits:
+        return []
+    ratios = ", ".join(f"{fit.axis} {_number(fit.chi2_per_dof)}" for fit in fits)
+    lines = [f"Misfit, median chi2/dof (1 is right): {ratios}"]
+    failing = [f"{fit.axis} in {_share(fit.failing_share)} of its windows" for fit in fits if fit.fails]
+    if failing:
+        line = f"The terms do not describe {', '.join(failing)}, where no term is called observed"
+        start = find_fit_from(product)
+        remedy = f"from {start:g} s on they do: fit again with --fit-from {start:g}s" if start else (
+            "no shortest averaging time of the fit changes that: look for lines, vibration or motion in the record"
+        )
+        lines.append(f"{line}; {remedy}.")
+    return lines
+
+
+def _describe_outliers(product: xr.Dataset) -> list[str]:
+    if "outlier_count" not in product:
+        return []
+    worst = {str(axis): product["outlier_count"].sel(axis=axis).values for axis in product["axis"].values}
+    said = [
+        f"{axis} in {np.count_nonzero(counts)} windows (at most {int(counts.max())} in one)"
+        for axis, counts in worst.items()
+        if counts.size and counts.max() > 0
+    ]
+    return [f"Outliers, single samples far from both neighbours: {', '.join(said)}"] if said else []
+
+
+def _describe_motion(product: xr.Dataset) -> list[str]:
+    said = []
+    for axis in product["axis"].values:
+        mean = product["window_mean"].sel(axis=axis).values
+        away = np.abs(mean - np.nanmedian(mean)) if np.isfinite(mean).any() else np.zeros(1)
+        count = int(np.count_nonzero(away > _MOST_AT_REST_DEG_H))
+        if count:
+            said.append(f"{axis} in {count} windows (up to {_number(float(np.nanmax(away)))} deg/h)")
+    if not said:
+        return []
+    reason = "motion, or a bias that drifts; leave such times out with --exclude"
+    return [f"Mean rate more than twice the Earth rate from its median: {', '.join(said)}: {reason}."]
