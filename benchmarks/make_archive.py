@@ -124,7 +124,10 @@ def write(path: Path, counts: NDArray[np.int32], missing: NDArray[np.bool_], fir
         write_csv(path, counts, missing, first, options)
         return
     log = regular_log(counts, missing, first, options)
-    {"nc": gyrostab.to_netcdf, "zarr": gyrostab.to_zarr}[options.format](log, path, overwrite=True)
+    if options.format == "zarr":
+        gyrostab.to_zarr(log, path, overwrite=True)
+    else:
+        gyrostab.to_netcdf(log, path, overwrite=True, compression="zstd")
 
 
 def regular_log(counts: NDArray[np.int32], missing: NDArray[np.bool_], first: int, options: argparse.Namespace) -> xr.Dataset:

@@ -11,6 +11,7 @@ import xarray as xr
 from gyrostab.errors import OutputError, SchemaError
 from gyrostab.progress import Stage, no_stage
 from gyrostab.run import load_log, samples_of
+from gyrostab.summary import TermSummary, summarise_terms
 
 __all__ = ["find_parts", "format_summary", "run_demo", "sample_log", "summarise"]
 
@@ -89,32 +90,21 @@ def summarise(product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Times
         One row per axis and term: axis, term, unit, and one column of text per part: the median where most windows observe the term,
         ``< x`` with the median of the upper limits where most do not.
     """
-    from gyrostab.noise import LAWS
-
     half = pd.Timedelta(seconds=float(product.attrs["window_s"])) / 2
     centre = pd.DatetimeIndex(product["time"].values)
-    rows = []
-    for axis in product["axis"].values:
-        for symbol, law in LAWS.items():
-            row = {"axis": str(axis), "term": symbol, "unit": law.label}
-            for name, (start, end) in parts.items():
-                inside = (centre - half >= start) & (centre + half <= end)
-                row[name] = _one_cell(product.sel(axis=axis).isel(time=np.flatnonzero(inside)), symbol)
-            rows.append(row)
-    return pd.DataFrame(rows)
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for name, (start, end) in parts.items():
+        inside = np.flatnonzero((centre - half >= start) & (centre + half <= end))
+        for term in summarise_terms(product.isel(time=inside)):
+            row = rows.setdefault((term.axis, term.symbol), {"axis": term.axis, "term": term.symbol, "unit": term.unit})
+            row[name] = _format_term(term)
+    return pd.DataFrame(list(rows.values()))
 
 
-def _one_cell(part: xr.Dataset, symbol: str) -> str:
-    flags = part["observable"].sel(term=symbol).values
-    if flags.size and np.mean(flags == 2) > 0.5:
-        return _round(np.median(part[symbol].values[flags == 2]), 3)
-    upper = part[f"{symbol}_upper"].values
-    upper = upper[np.isfinite(upper)]
-    return f"< {_round(np.median(upper), 2)}" if upper.size else "-"
-
-
-def _round(value: float, digits: int) -> str:
-    return f"{float(f'{value:.{digits}g}'):g}"
+def _format_term(term: TermSummary) -> str:
+    if term.status == "not_observable":
+        return "-"
+    return f"{term.value:.3g}" if term.status == "observed" else f"< {term.value:.2g}"
 
 
 def format_summary(summary: pd.DataFrame) -> str:

@@ -63,7 +63,8 @@ def to_netcdf(
     overwrite : bool
         Replace an existing file, unless the dataset is lazy and still reads from it.
     compression : {"zstd", "zlib"}, optional
-        zstd is two to four times as fast, zlib is read by every NetCDF program. By default zstd for a log, zlib for everything else.
+        zlib is read by every NetCDF program and is the default; zstd is two to four times as fast, and Octave, MATLAB and
+        h5netcdf do not read it.
     progress : callable, optional
         Told the share of the long variables that is written.
 
@@ -94,7 +95,7 @@ def to_netcdf(
     """
     stored = to_disk(dataset, "to_netcdf")
     sources = find_sources(dataset)
-    filters = _filters(compression, log=_rate(stored) is not None)
+    filters = _filters(compression)
 
     def write(packed: xr.Dataset) -> None:
         log = _rate(packed) is not None
@@ -136,14 +137,13 @@ def _netcdf_encoding(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, d
     return encoding
 
 
-def _filters(compression: str | None, *, log: bool) -> dict[str, Any]:
+def _filters(compression: str | None) -> dict[str, Any]:
     """Compression of a NetCDF file, with checksums where the compression has none of its own."""
     import netCDF4
 
     if compression not in (None, "zstd", "zlib"):
         raise OptionError(f"compression={compression!r}: give 'zstd' or 'zlib'")
-    chosen = compression or ("zstd" if log else "zlib")
-    if chosen == "zstd":
+    if compression == "zstd":
         with netCDF4.Dataset("probe", "w", diskless=True, persist=False) as probe:
             if probe.has_zstd_filter():
                 return {"compression": "zstd", "complevel": 3, "fletcher32": True}

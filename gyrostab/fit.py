@@ -236,9 +236,7 @@ def _inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, i
     return [surface[name].data for name in names], ks, rate, window
 
 
-def _fit_gls(
-    surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool, observed_only: bool
-) -> xr.Dataset:
+def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool, observed_only: bool) -> xr.Dataset:
     cells, ks, rate, window = _inputs(surface)
     chosen = within[_choose(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
@@ -308,9 +306,7 @@ def _choose(ks: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.unique(np.abs(np.log(ks)[:, None] - np.log(wanted)[None, :]).argmin(axis=0))
 
 
-def _fit_block(
-    flat: list[NDArray[np.float64]], tables: _Tables, allowed: int, observed_only: bool
-) -> NDArray[np.float64]:
+def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int, observed_only: bool) -> NDArray[np.float64]:
     """Coefficients, errors, limits, observability (n_terms each), chi2, dof and edf of each window, side by side."""
     result, misfit, dof = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed)
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}

@@ -25,17 +25,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import xarray as xr
 
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
-from gyrostab.schema import OBSERVABLE, check_product, texts
+from gyrostab.schema import texts
+from gyrostab.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
 
 __all__ = ["KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]
-
-_LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
 
 #: Key -> symbol of the term, factor from the unit of the field, unit of Kalibr.
 KEYS = {
@@ -52,7 +50,8 @@ class KalibrValue:
     Attributes
     ----------
     value : float
-        Median over the windows that observe the term, else of their upper limits [unit of the key in `KEYS`]; NaN when there is neither.
+        Median over the windows that observe the term, or of their upper limits where more windows only bound it [unit of
+        the key in `KEYS`]; NaN when there is neither.
     meaning : str
         What the value is.
     share : float
@@ -82,20 +81,18 @@ def kalibr_noise(product: xr.Dataset) -> dict[str, dict[str, KalibrValue]]:
     SchemaError
         When it is no product.
     """
-    check_product(product)
-    return {
-        str(axis): {key: _median(product.sel(axis=axis), symbol, factor) for key, (symbol, factor, _) in KEYS.items()}
-        for axis in product["axis"].values
-    }
+    keys = {symbol: (key, factor) for key, (symbol, factor, _) in KEYS.items()}
+    found: dict[str, dict[str, KalibrValue]] = {}
+    for term in summarise_terms(product):
+        if term.symbol in keys:
+            key, factor = keys[term.symbol]
+            found.setdefault(term.axis, {})[key] = _convert_term(term, factor)
+    return {axis: {key: values[key] for key in KEYS} for axis, values in found.items()}
 
 
-def _median(part: xr.Dataset, symbol: str, factor: float) -> KalibrValue:
-    state = part["observable"].sel(term=symbol).values
-    for flag, name in ((_SEEN, symbol), (_LIMIT, f"{symbol}_upper")):
-        values = np.where(state == flag, part[name].values, np.nan)
-        if np.isfinite(values).any():
-            return KalibrValue(float(np.nanmedian(values)) * factor, OBSERVABLE[flag], float(np.isfinite(values).mean()))  # type: ignore[arg-type]
-    return KalibrValue(math.nan, "not_observable", 0.0)
+def _convert_term(term: TermSummary, factor: float) -> KalibrValue:
+    share = {"observed": term.observed_share, "upper_limit_only": term.limited_share}.get(term.status, 0.0)
+    return KalibrValue(term.value * factor, term.status, share)
 
 
 def to_kalibr(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
@@ -131,6 +128,7 @@ def to_kalibr(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
         "# Noise of a gyro for Kalibr: medians over the windows of a dynamic Allan variance, made by gyrostab",
         f"# from {', '.join(names) or 'a log'}. At the top the worst axis, below each of them.",
         "# Kalibr also asks for rostopic, accelerometer_noise_density and accelerometer_random_walk: a gyro log does not tell them.",
+        *(_describe_fit(fit) for fit in summarise_fit(product)),
         f"update_rate: {float(rate)!r}  # Hz",
     ]
     for key in KEYS:
@@ -145,6 +143,16 @@ def to_kalibr(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
     return Path(path)
 
 
+def _describe_fit(fit: FitSummary) -> str:
+    """Say in a comment how well the noise terms describe an axis."""
+    if not fit.windows:
+        return f"# axis {fit.axis}: no window has a misfit to judge the fit by"
+    text = f"# axis {fit.axis}: median chi2/dof {fit.chi2_per_dof:.3g} over {fit.windows} windows"
+    if fit.fails:
+        text += f"; the noise terms do NOT describe {fit.failing_share:.0%} of them: fit again with a longer --fit-from"
+    return text
+
+
 def _worst(values: list[KalibrValue]) -> KalibrValue:
     """The largest value that any axis may have; an axis that tells nothing leaves it to the others."""
     known = [value for value in values if not math.isnan(value.value)]
@@ -155,7 +163,7 @@ def _entry(key: str, found: KalibrValue, *, indent: str) -> list[str]:
     symbol, _, unit = KEYS[key]
     said = {
         "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, observed in {found.share:.0%} of the windows",
-        "upper_limit_only": f"{unit}; 95 % UPPER LIMIT: no window observes {symbol} ({LAWS[symbol].name}), {found.share:.0%} bound it",
+        "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({LAWS[symbol].name}), in {found.share:.0%} of the windows",
         "not_observable": f"{unit}; not observable in any window: a longer --window may show {symbol} ({LAWS[symbol].name})",
     }[found.meaning]
     number = "null" if math.isnan(found.value) else f"{found.value:.6e}"

@@ -16,6 +16,7 @@ from gyrostab.schema import OBSERVABLE, check_product
 __all__ = [
     "FitSummary",
     "TermSummary",
+    "describe_record",
     "find_fit_from",
     "format_product",
     "summarise_fit",
@@ -124,11 +125,7 @@ def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
     ('N', 'observed', 0.01)
     """
     check_product(product)
-    return [
-        _summarise_term(product.sel(axis=axis), str(axis), symbol)
-        for axis in product["axis"].values
-        for symbol in LAWS
-    ]
+    return [_summarise_term(product.sel(axis=axis), str(axis), symbol) for axis in product["axis"].values for symbol in LAWS]
 
 
 def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
@@ -212,8 +209,8 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     tau = windows["tau"].values
     longest = float(product.attrs.get("fit_tau_max_s", tau[-1]))
     shortest = 2.0 * float(product.attrs.get("fit_tau_min_s", tau[0]))
-    for start in tau[(tau >= shortest * (1 - 1e-9)) & (tau <= longest / _LEAST_SPAN)]:
-        if start < shortest * (1 - 1e-9):
+    for start in tau[tau <= longest / _LEAST_SPAN]:
+        if start < shortest:
             continue
         if not any(summary.fails for summary in summarise_fit(refit(windows, tau_min=float(start)))):
             return float(start)
@@ -243,7 +240,23 @@ def format_product(product: xr.Dataset) -> str:
         rows.append((term.axis, term.symbol, sign + _number(term.value), spread, term.unit, _share(term.observed_share)))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-    return "\n".join([*lines, "", *_describe_misfit(product), *_describe_outliers(product), *_describe_motion(product)])
+    return "\n".join([*lines, "", *describe_record(product)])
+
+
+def describe_record(product: xr.Dataset) -> list[str]:
+    """Say in a few sentences how well the terms describe a product, and what disturbed the record.
+
+    Parameters
+    ----------
+    product : xarray.Dataset
+        Product of `gyrostab.fit_noise`.
+
+    Returns
+    -------
+    list of str
+        A sentence each: misfit, and outliers and motion where there are any.
+    """
+    return [*_describe_misfit(product), *_describe_outliers(product), *_describe_motion(product)]
 
 
 def _number(value: float) -> str:
@@ -259,13 +272,15 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
     if not fits:
         return []
     ratios = ", ".join(f"{fit.axis} {_number(fit.chi2_per_dof)}" for fit in fits)
-    lines = [f"Misfit, median chi2/dof (1 is right): {ratios}"]
+    lines = [f"Misfit, median chi2/dof (1 is right): {ratios}."]
     failing = [f"{fit.axis} in {_share(fit.failing_share)} of its windows" for fit in fits if fit.fails]
     if failing:
         line = f"The terms do not describe {', '.join(failing)}, where no term is called observed"
         start = find_fit_from(product)
-        remedy = f"from {start:g} s on they do: fit again with --fit-from {start:g}s" if start else (
-            "no shortest averaging time of the fit changes that: look for lines, vibration or motion in the record"
+        remedy = (
+            f"from {start:g} s on they do: fit again with --fit-from {start:g}s"
+            if start
+            else ("no shortest averaging time of the fit changes that: look for lines, vibration or motion in the record")
         )
         lines.append(f"{line}; {remedy}.")
     return lines
@@ -280,7 +295,7 @@ def _describe_outliers(product: xr.Dataset) -> list[str]:
         for axis, counts in worst.items()
         if counts.size and counts.max() > 0
     ]
-    return [f"Outliers, single samples far from both neighbours: {', '.join(said)}"] if said else []
+    return [f"Outliers, single samples far from both neighbours: {', '.join(said)}."] if said else []
 
 
 def _describe_motion(product: xr.Dataset) -> list[str]:

@@ -47,6 +47,7 @@ def product(*, windows: int = 40, taus: int = 12, axes: str = "xyz", seed: int =
         "estimator": (names, estimator),
         "white_response": (names, ones),
         "quantization_response": (names, ones),
+        "gap_factor": (names, coverage),
     }
     data |= _coefficients(true, gap, rng)
     data["window_mean"] = (names[:2], rng.normal(7.0, 0.1, shape[:2]))
@@ -94,8 +95,8 @@ def _coefficients(true: dict[str, np.ndarray], gap: slice, rng: np.random.Genera
         state = observable[..., number]
         error = 0.05 * true[symbol]
         value = true[symbol] + error * rng.normal(size=shape)
-        data[symbol] = (("axis", "time"), np.where(state >= 1, value, np.nan))
-        data[f"{symbol}_stderr"] = (("axis", "time"), np.where(state >= 1, error, np.nan))
+        data[symbol] = (("axis", "time"), np.where(state == 2, value, np.nan))
+        data[f"{symbol}_stderr"] = (("axis", "time"), np.where(state == 2, error, np.nan))
         data[f"{symbol}_upper"] = (("axis", "time"), np.where(state == 1, true[symbol] * 1.6, np.nan))
         if symbol in "NK":
             data[f"{symbol}_squared"] = (("axis", "time"), data[symbol][1] ** 2)

@@ -114,7 +114,8 @@ class Windows:
     Parameters
     ----------
     window
-        Length of the sliding window: 10min, 500ms, 2h or 2000samples.
+        Length of the sliding window: 10min, 500ms, 2h or 2000samples (default: 10min, or a shorter one that fits four times
+        into the record).
     step
         Distance from one window to the next, in the same manner (default: a tenth of the window).
     taus
@@ -129,7 +130,7 @@ class Windows:
         Only this gyro axis: x. Repeat for more.
     """
 
-    window: Annotated[str, Parameter(metavar="DURATION")] = "10min"
+    window: Annotated[str | None, Parameter(metavar="DURATION")] = None
     step: Annotated[str | None, Parameter(metavar="DURATION")] = None
     taus: Annotated[str, Parameter(metavar="LIST")] = "40"
     tau_max: Annotated[str | None, Parameter(metavar="DURATION")] = None

@@ -45,7 +45,7 @@ _SHARE = 1 / 2
 def davar(
     log: xr.Dataset,
     *,
-    window: Any,
+    window: Any = None,
     step: Any = None,
     taus: Any = 40,
     tau_max: Any = None,

@@ -13,10 +13,12 @@ from gyrostab.kernels.surface import Unit
 from gyrostab.schema import check_log, signal_name
 from gyrostab.windows import averaging_factors, samples, thin
 
-__all__ = ["MOST_CELLS", "Plan", "last_sample", "make_plan", "units_of_work"]
+__all__ = ["MOST_CELLS", "WINDOWS_S", "Plan", "choose_window", "last_sample", "make_plan", "units_of_work"]
 
 #: Cells (windows times averaging times) of a unit of work, and of a part of a surface over all axes, at most.
 MOST_CELLS = 2**20
+#: Windows that are chosen where none is given, the longest that fits four times into the record [s].
+WINDOWS_S = (600, 300, 120, 60, 30, 20, 10, 5, 2, 1)
 _METHODS = ("blocks", "direct", "recursive")
 _GAPS = ("bridge", "zero")
 _OVERLAPS = ("full", "octave")
@@ -33,7 +35,7 @@ class Plan(NamedTuple):
 
 
 def make_plan(
-    log: xr.Dataset, *, window: Any, step: Any = None, taus: Any = 40, tau_max: Any = None, axis: str | Sequence[str] | None = None,
+    log: xr.Dataset, *, window: Any = None, step: Any = None, taus: Any = 40, tau_max: Any = None, axis: str | Sequence[str] | None = None,
     overlap: str = "full", gaps: str = "bridge", min_strict: float = 0.3, min_coverage: float = 0.1, method: str = "blocks",
     convention: str = "all",
 ) -> Plan:  # fmt: skip
@@ -44,7 +46,7 @@ def make_plan(
     signal = log[name] if axis is None else _pick(log[name], axis)
     rate = float(log.attrs["sampling_rate_hz"])
     intervals = signal.sizes["time"] - (1 if name == "angle" else 0)
-    length, hop = _window_and_step(window, step, rate, intervals)
+    length, hop = _window_and_step(choose_window(log) if window is None else window, step, rate, intervals)
     ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max)
     shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
     ks = np.unique(ks >> shifts << shifts)
@@ -56,6 +58,32 @@ def make_plan(
         "min_strict": min_strict, "min_coverage": min_coverage,
     }  # fmt: skip
     return Plan(signal, unit, rate, attrs)
+
+
+def choose_window(log: xr.Dataset) -> str:
+    """Choose a window for a record: ten minutes, or what leaves four windows side by side in a shorter record.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        Regular log.
+
+    Returns
+    -------
+    str
+        A duration of `WINDOWS_S`, or a number of samples where the record is shorter than four seconds.
+
+    Examples
+    --------
+    >>> from gyrostab.log import make_log
+    >>> choose_window(make_log(np.zeros(8600), rate=100.0, unit="deg/h"))
+    '20s'
+    """
+    size, rate = log.sizes["time"], float(log.attrs["sampling_rate_hz"])
+    seconds = next((window for window in WINDOWS_S if 4 * window * rate <= size), None)
+    if seconds is None:
+        return f"{max(4, size // 4)}samples"
+    return f"{seconds}s" if seconds < 60 else f"{seconds // 60}min"
 
 
 def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> None:

@@ -14,6 +14,7 @@ from gyrostab.output import new_output
 from gyrostab.plot.style import duration, embedded
 from gyrostab.report.page import page_text
 from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_log, check_product, texts
+from gyrostab.summary import TermSummary, describe_record, summarise_terms
 
 __all__ = ["write_report"]
 
@@ -50,7 +51,9 @@ def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.D
     check_product(product)
     if log is not None:
         check_log(log)
-    table = [(str(name), _coefficients(product.sel(axis=name))) for name in product["axis"].values]
+    terms = summarise_terms(product)
+    axes = dict.fromkeys(term.axis for term in terms)
+    table = [(axis, _coefficients([term for term in terms if term.axis == axis])) for axis in axes]
     gaps = None if log is None or "gap_start" not in log.variables else _gaps(log)
     with new_output(path, overwrite=overwrite) as temporary:
         text = page_text(
@@ -135,7 +138,7 @@ def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]
         )
     else:
         lines.append("No sample is missing in any window.")
-    return lines
+    return [*lines, *describe_record(product)]
 
 
 def _change(part: xr.Dataset) -> str:
@@ -179,30 +182,21 @@ def _estimators(product: xr.Dataset) -> list[tuple[str, float]]:
     return [(label, float(counts[number] / counts.sum())) for number, label in enumerate(labels)]
 
 
-def _coefficients(part: xr.Dataset) -> list[dict[str, Any]]:
-    rows = []
-    for symbol, law in LAWS.items():
-        state = part["observable"].sel(term=symbol).values
-        seen, limited = state == OBSERVABLE.index("observed"), state == OBSERVABLE.index("upper_limit_only")
-        values = part[symbol].values[seen]
-        values = values[np.isfinite(values)]
-        limits = part[f"{symbol}_upper"].values[limited]
-        limits = limits[np.isfinite(limits)]
-        low, high = np.quantile(values, [0.05, 0.95]) if values.size else (np.nan, np.nan)
-        rows.append(
-            {
-                "symbol": symbol,
-                "name": law.name,
-                "unit": law.label,
-                "median": _number(float(np.median(values)) if values.size else np.nan),
-                "range": f"{_number(low)} to {_number(high)}" if values.size else "–",
-                "observed": _share(float(seen.mean())),
-                "rare": f" (observed in {_share(float(seen.mean()))} of the windows only)" if seen.mean() < 0.5 else "",
-                "limited": _share(float(limited.mean())),
-                "limit": f"< {_number(float(np.median(limits)))}" if limits.size else "–",
-            }
-        )
-    return rows
+def _coefficients(terms: list[TermSummary]) -> list[dict[str, Any]]:
+    return [
+        {
+            "symbol": term.symbol,
+            "name": LAWS[term.symbol].name,
+            "unit": term.unit,
+            "median": _number(term.median),
+            "range": f"{_number(term.low)} to {_number(term.high)}" if np.isfinite(term.median) else "–",
+            "observed": _share(term.observed_share),
+            "rare": f" (observed in {_share(term.observed_share)} of the windows only)" if term.observed_share < 0.5 else "",
+            "limited": _share(term.limited_share),
+            "limit": f"< {_number(term.limit)}" if np.isfinite(term.limit) else "–",
+        }
+        for term in terms
+    ]
 
 
 def _gaps(log: xr.Dataset) -> list[dict[str, Any]]:

@@ -10,7 +10,9 @@ from gyrostab.errors import OptionError
 __all__ = ["check_windows"]
 
 
-def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau_max: str | None = None, **other: Any) -> None:
+def check_windows(
+    *, window: str | None = None, step: str | None = None, taus: str = "40", tau_max: str | None = None, **other: Any
+) -> None:
     """Make sure, before the long work starts, that the lengths of time can be read at all.
 
     Parameters
@@ -32,6 +34,8 @@ def check_windows(*, window: str, step: str | None = None, taus: str = "40", tau
     from gyrostab.windows import TAUS, averaging_factors, duration_seconds, samples
 
     fine = 1e6  # Hz; the true rate is not known yet
+    if window is None:  # chosen when the record is known
+        return
     length, hop = samples(window, fine, "window"), samples(step, fine, "step") if step else 1
     if step and ("sample" in window) == ("sample" in step) and hop > length:
         raise OptionError(f"the step of {step} is longer than the window of {window}, so samples would be left out; give a shorter --step")

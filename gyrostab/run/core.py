@@ -279,6 +279,7 @@ def _is_log(path: Path) -> bool:
 def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _Begun, pool: Pool, stage: Stage) -> None:
     """Compute what is missing of the job."""
     from gyrostab.davar import davar_parts
+    from gyrostab.davar.plan import choose_window
     from gyrostab.export import to_zarr
 
     reading, windows, fitting = (job.options[name] for name in ("reading", "windows", "fitting"))
@@ -290,6 +291,9 @@ def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _
     stage("reading", 0)
     on_file = partial(_say_file, stage)
     log = load_log([store]) if store.exists() else load_log(paths, **reading, on_file=on_file)
+    if "window" not in windows:
+        windows = {**windows, "window": choose_window(log)}
+        warnings.warn(f"the window is {windows['window']}; --window gives another", stacklevel=2)
     parts = davar_parts(log, **windows)
     begin_job(job.folder, job.fingerprint, parts=len(parts), overwrite=begun.overwrite)
     blocks.update(find_blocks(job.folder, parts, job=job.name))

@@ -55,7 +55,8 @@ def ingest(
     output
         File to write, LOG.nc or LOG.zarr.
     compression
-        Of a NetCDF file: zstd is fast, zlib is read by programs that lack zstd, such as Octave and R on many systems (default: zstd).
+        Of a NetCDF file: zlib is read by every program; zstd is faster, but Octave, MATLAB and h5netcdf do not read it
+        (default: zlib).
     """
     from gyrostab.export import to_netcdf, to_zarr
     from gyrostab.output import check_output

@@ -38,7 +38,8 @@ def run(
     output
         NetCDF file to write.
     """
-    print(_job(logs, output, windows, reading, running, common, fitting=fitting.options()))
+    target = _job(logs, output, windows, reading, running, common, fitting=fitting.options())
+    _print_product(target)
 
 
 @app.command(sort_key=4, help_epilogue="")
@@ -94,6 +95,19 @@ def fit(
     with work(common) as stage:
         stage("fitting", 0)
         to_netcdf(fit_noise(open_surface(surface), **fitting.options()), target, overwrite=common.overwrite)
+    _print_product(target)
+
+
+def _print_product(target: Path) -> None:
+    """Print what a product says, the command to run next, and the file."""
+    from shlex import quote
+
+    from gyrostab.export import open_product
+    from gyrostab.summary import format_product
+
+    with open_product(target) as product:
+        print(format_product(product))
+    print(f"\nNext: gyrostab report {quote(str(target))} -o {quote(str(target.with_suffix('.html')))}")
     print(target)
 
 
