@@ -29,8 +29,9 @@ _TRIED_WINDOWS = 24
 #: A share of failing windows that is not worth a remark: a window that the terms do describe fails in 0.1 to 2 % of cases
 #: (docs/method.md), and in a record of few windows one of them is no evidence.
 _FAILING_SHARE = 0.05
-#: Least ratio of longest to shortest averaging time that tells five terms apart: below two decades of slope they merge.
-_LEAST_SPAN = 100.0
+#: Least ratio of longest to shortest averaging time: over a decade, the Allan variances of neighbouring terms, whose slopes
+#: differ by one, part by a factor of ten.
+_LEAST_SPAN = 10.0
 #: Twice the rotation of the Earth, 15.041 deg/h: no change of attitude at rest moves the mean rate further.
 _MOST_AT_REST_DEG_H = 30.082
 
@@ -198,7 +199,7 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     -------
     float or None
         Averaging time [s] for ``--fit-from`` (``tau_min`` of `gyrostab.fit_noise`); None when the terms describe the
-        product as it is, or when no averaging time leaves two decades to fit.
+        product as it is, or when no averaging time leaves a decade to fit.
     """
     failing = [summary.axis for summary in summarise_fit(product) if summary.fails]
     if not failing:

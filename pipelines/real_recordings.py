@@ -32,7 +32,8 @@ def pick(value, log, product):
 def examine(entry, file):
     """Go from the log to a product on disk and back, and compute every number that the text speaks of."""
     log = gyrostab.regularise(gyrostab.read_log(entry["files"], **entry["read"]))
-    product = gyrostab.open_product(gyrostab.to_netcdf(gyrostab.fit_noise(gyrostab.davar(log, **entry["davar"])), file)).load()
+    product = gyrostab.fit_noise(gyrostab.davar(log, **entry["davar"]), **entry.get("fit", {}))
+    product = gyrostab.open_product(gyrostab.to_netcdf(product, file)).load()
     found = {"hertz": log.attrs["sampling_rate_hz"], "minutes": np.ptp(log["time"].values) / np.timedelta64(1, "m")}
     found["missing"] = float(log["rate"].isnull().mean())
     for name, value in entry["values"].items():
@@ -53,7 +54,8 @@ def refusal(entry):
 def command(entry):
     """Write the same job as a line for the shell."""
     words = ["gyrostab", "run", *entry["files"], "-o", "product.nc"]
-    for option, given in {**entry["read"], **entry["davar"]}.items():
+    fit = {option.replace("tau_min", "fit_from"): given for option, given in entry.get("fit", {}).items()}
+    for option, given in {**entry["read"], **entry["davar"], **fit}.items():
         texts = [f"{key}={text}" for key, text in given.items()] if isinstance(given, dict) else np.atleast_1d(given)
         words += [word for text in texts for word in (f"--{option.replace('_', '-')}", str(text))]
     return shlex.join(words)

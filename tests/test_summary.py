@@ -68,7 +68,7 @@ def test_the_proposed_averaging_time_leaves_a_fit_that_describes_the_record():
     start = find_fit_from(product)
     assert 0.05 < start < 1.0
     text = format_product(product)
-    assert f"--fit-from {start:g}s" in text
+    assert f"--fit-from {start:.3g}s" in text
     again = gyrostab.fit_noise(product, tau_min=start)
     assert not summarise_fit(again)[0].fails
     # 1.005: the boxcar leaves the noise at averaging times of ten filter lengths and more as it was
