@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import math
+import re
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import xarray as xr
 
 from gyrostab.errors import GyrostabError
 
-__all__ = ["COLUMNS", "print_scan", "scan"]
+if TYPE_CHECKING:
+    from gyrostab.read.guess import Guess
+    from gyrostab.read.look import FileLook
+
+__all__ = ["COLUMNS", "Examined", "Look", "examine", "next_command", "print_look", "print_next", "print_scan", "scan"]
+
+#: Share of missing samples above which the sampling rate may be wrong: it is then tried with the mean rate of the rows.
+MUCH_MISSING = 0.1
+#: Default of ``gyrostab run --window`` [s].
+DEFAULT_WINDOW_S = 600.0
 
 #: Columns of the table; span in s, rate in Hz, missing as a share of the samples between start and end.
 COLUMNS = ("file", "format", "start", "end", "span_s", "rate_hz", "axes", "channels", "rows", "gaps", "missing_share", "odd")
@@ -52,20 +65,168 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     >>> print(table.loc[0, "rate_hz"], table.loc[0, "axes"], table.loc[0, "rows"])
     10.0 x 50
     """
+    examined = examine(paths, look=False, **reading)
+    if examined.errors and len(examined.errors) == len(examined.table):
+        raise examined.errors[0]
+    return examined.table
+
+
+@dataclass(frozen=True)
+class Look:
+    """What was found in a file that cannot be read as it is: its columns, the guess, and the options that read it."""
+
+    paths: list[Path]  # with the same columns; the first was looked into
+    look: FileLook
+    guess: Guess
+    options: dict[str, Any]
+    row: dict[str, Any] | None  # of the table, read with these options
+    error: str | None  # why it cannot be read with them
+
+
+@dataclass(frozen=True)
+class Examined:
+    """The table of `scan`, the errors of files that cannot be read as they are, and a look into them."""
+
+    table: pd.DataFrame
+    errors: list[GyrostabError]
+    looks: list[Look]
+
+
+def examine(paths: Sequence[str | Path] | str | Path, *, look: bool = True, **reading: Any) -> Examined:
+    """Scan logs, and look into each column of those that cannot be read as they are.
+
+    Parameters
+    ----------
+    paths, **reading
+        As for `scan`.
+    look : bool
+        Look into the columns. Of files with the same columns the first is looked into.
+
+    Returns
+    -------
+    Examined
+        Nothing is raised for a file that cannot be read.
+    """
     from gyrostab.read.files import expand
 
-    names = expand(paths)
     rows: list[dict[str, Any]] = []
     errors: list[GyrostabError] = []
-    for path in names:
+    looks: dict[Any, Look | None] = {}
+    for path in expand(paths):
         try:
             rows.append(_scan_one(path, reading))
         except GyrostabError as error:
             errors.append(error)
+            found = _look(path, reading, looks) if look else None
             rows.append({"file": str(path), "odd": str(error)})
-    if errors and len(errors) == len(names):
-        raise errors[0]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+            if found is not None:
+                rows[-1].update(format=found.look.summary.format)
+                rows[-1].update(rows=found.look.rows if found.paths == [path] else None)
+    return Examined(pd.DataFrame(rows, columns=list(COLUMNS)), errors, [found for found in looks.values() if found is not None])
+
+
+def _look(path: Path, reading: dict[str, Any], looks: dict[Any, Look | None]) -> Look | None:
+    """Look into a file, unless one with the same columns was looked into."""
+    from gyrostab.read import ReadOptions, scan_file
+    from gyrostab.read.guess import guess_columns
+    from gyrostab.read.look import look_into
+
+    options = ReadOptions(**{name: value for name, value in reading.items() if name not in ("max_gap", "on_file")})
+    try:
+        headers = tuple((column.header, column.role, column.unit) for column in scan_file(path, options).columns)
+        if headers not in looks:
+            looks[headers] = None
+            inside = look_into(path, options)
+            angles = options.kind == "angle"
+            guess = guess_columns(inside, rate=options.rate, rate_hint=_named_rate(path), angles=angles)
+            looks[headers] = _try_guess(path, inside, guess, reading)
+    except GyrostabError:
+        return None
+    found = looks[headers]
+    if found is not None and path not in found.paths:
+        found.paths.append(path)
+    return found
+
+
+def _try_guess(path: Path, look: FileLook, guess: Guess, reading: dict[str, Any]) -> Look:
+    """Read the file by the guess, and with the sampling rate if the stamps alone do not tell it."""
+    from gyrostab.read.guess import temperature_unit
+
+    options = {**reading, "map": dict(reading.get("map", {})), "unit": dict(reading.get("unit", {}))}
+    options["map"].update({column.key: f"gyro_{axis}" for axis, column in guess.axes.items() if column.role != "gyro"})
+    if guess.unit is not None:
+        angle = any(column.name.lower().startswith("angle_") for column in guess.axes.values())
+        options["unit"]["angle" if angle else "gyro"] = guess.unit
+    if guess.time is not None:
+        if guess.time.role != "time":
+            options["map"][guess.time.key] = "time"
+        options["unit"]["time"] = guess.time_unit
+    if guess.temperature is not None and guess.temperature.role != "channel":
+        options["map"][guess.temperature.key] = f"temperature [{temperature_unit(guess.temperature)}]"
+    if guess.rate is not None:
+        options["rate"] = guess.rate
+    options = {name: value for name, value in options.items() if value != {}}
+    tries = [options]
+    if "rate" not in options and math.isfinite(look.rate_hz):
+        tries.append({**options, "rate": float(f"{look.rate_hz:.6g}")})
+    reason = "no column looks like a gyro"
+    read: list[Look] = []
+    for trial in tries if guess.axes else []:
+        try:
+            read.append(Look([path], look, guess, trial, _scan_one(path, trial), None))
+        except GyrostabError as error:
+            reason = str(error)
+        if read and read[-1].row is not None and read[-1].row["missing_share"] < MUCH_MISSING:
+            break
+    best = min(read, key=lambda found: found.row["missing_share"] if found.row else 1.0, default=None)
+    return best or Look([path], look, guess, options, None, reason)
+
+
+def _named_rate(path: Path) -> float | None:
+    """A sampling rate that a text at the beginning of a file names, as ``100 Hz``."""
+    from gyrostab.read.text import read_head
+
+    found = re.search(r"(?<![\w.])(\d+(?:\.\d+)?) ?(k?)Hz\b", read_head(path), re.IGNORECASE)
+    rate = float(found[1]) * (1000.0 if found[2] else 1.0) if found else 0.0
+    return rate or None
+
+
+def next_command(paths: Sequence[str | Path], options: dict[str, Any], span_s: float) -> str:
+    """The complete command that makes a product of logs.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        The logs.
+    options : dict
+        Options of reading, as `scan` takes them.
+    span_s : float
+        Length of the record [s]; a short one needs a shorter window than the default.
+
+    Examples
+    --------
+    >>> next_command(["run 7.csv"], {"map": {"wx": "gyro_x"}, "unit": {"gyro": "deg/s"}}, 3600.0)
+    "gyrostab run 'run 7.csv' -o product.nc --map wx=gyro_x --unit gyro=deg/s"
+    """
+    number, target = 2, Path("product.nc")
+    while target.exists():
+        number, target = number + 1, Path(f"product_{number}.nc")
+    words = ["gyrostab", "run", *map(str, paths), "-o", str(target)]
+    for name, value in options.items():
+        flag = {"limits": "--limit"}.get(name, f"--{name.replace('_', '-')}")
+        if isinstance(value, Mapping):
+            for key, text in value.items():
+                words += [flag, f"{key}={text}"]
+        elif isinstance(value, tuple | list):
+            for item in value:
+                words += [flag, str(item)]
+        elif value is True:
+            words.append(flag)
+        else:
+            words += [flag, f"{value:.10g}" if isinstance(value, float) else str(value)]
+    if span_s < DEFAULT_WINDOW_S:
+        words += ["--window", f"{max(1, math.floor(span_s / 4))}s" if span_s >= 4 else f"{math.floor(span_s * 250)}ms"]
+    return shlex.join(words)
 
 
 def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
@@ -119,7 +280,8 @@ def print_scan(table: pd.DataFrame) -> None:
         framed.add_column(heading, overflow="fold", justify="right" if heading in ("rows", "gaps", "missing") else "left")
     for _, row in table.iterrows():
         if pd.isna(row["rate_hz"]):
-            framed.add_row(escape(row["file"]), "[red]cannot be read[/red]")
+            told = "cannot be read" if pd.isna(row["format"]) else "needs options, see below"
+            framed.add_row(escape(row["file"]), f"[red]{told}[/red]")
             continue
         cells = (
             f"{row['file']} ({row['format']})",
@@ -140,3 +302,76 @@ def print_scan(table: pd.DataFrame) -> None:
 
 def _span(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds < 60.0 else str(timedelta(seconds=round(seconds)))
+
+
+LOOK_COLUMNS = ("column", "unit", "low", "high", "mean", "scatter", "rate_hz", "taken_for")
+
+
+def _look_rows(found: Look) -> list[tuple[str, ...]]:
+    """The columns of a file as texts, one row each, as in `LOOK_COLUMNS`."""
+    guess = found.guess
+    taken = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
+    if guess.time is not None:
+        taken[guess.time.key] = "time"
+    if guess.temperature is not None:
+        taken.setdefault(guess.temperature.key, "temperature")
+    rows: list[tuple[str, ...]] = []
+    if found.look.time is not None:
+        time = found.look.time
+        rows.append((time.header, time.unit or "", "", "", "", "", _number(found.look.rate_hz), "time"))
+    for column in found.look.columns:
+        known = math.isfinite(column.rate_hz) or column.rows == 0
+        numbers = (column.low, column.high, column.mean, column.scatter, column.rate_hz if known else guess.sampling_rate_hz)
+        kept = column.name if column.role == "channel" else ""
+        rows.append((column.key, column.unit or "", *map(_number, numbers), taken.get(column.key, kept) if column.rows else "no numbers"))
+    return rows
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if math.isfinite(value) else ""
+
+
+def print_look(found: Look) -> None:
+    """Print what is in the columns of a file and the guess; in a pipe every line begins with ``#``."""
+    rows = _look_rows(found)
+    guess = found.guess
+    told = [*guess.reasons, *(f"check: {warning}" for warning in guess.warnings), *found.look.notes]
+    if found.row is not None:
+        read = found.row
+        told.append(
+            f"read so: {_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes {read['axes']}, {read['missing_share']:.2%} missing"
+        )
+    if found.error is not None and guess.axes:
+        told.append(f"not readable by this guess: {found.error}")
+    if not sys.stdout.isatty():
+        print(f"# {found.paths[0]}: {len(rows)} columns, {found.look.rows} rows")
+        for row in [LOOK_COLUMNS, *rows]:
+            print("# " + "\t".join(row))
+        for text in told:
+            print(f"# {text}")
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    framed = Table(title=escape(f"{found.paths[0]}: {found.look.rows:,} rows"))
+    for heading in LOOK_COLUMNS:
+        framed.add_column(
+            heading.replace("_", " "), overflow="fold", justify="left" if heading in ("column", "unit", "taken_for") else "right"
+        )
+    for row in rows:
+        framed.add_row(*map(escape, row))
+    console = Console()
+    console.print(framed)
+    for text in told:
+        console.print(escape(text), highlight=False)
+
+
+def print_next(command: str, *, apart: bool = False) -> None:
+    """Print the command to run next; with `apart` on stderr if stdout is a pipe, which then holds the plain table only."""
+    if sys.stdout.isatty():
+        print(f"next: {command}")
+    elif apart:
+        print(f"next: {command}", file=sys.stderr)
+    else:
+        print(f"# next: {command}")

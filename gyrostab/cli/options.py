@@ -64,6 +64,10 @@ class Reading:
     strict: Flag = False
     limit: Annotated[list[str] | None, Parameter(metavar="NAME=NUMBER", negative=())] = None
 
+    def given(self) -> dict[str, Any]:
+        """The options that differ from their defaults."""
+        return {name: value for name, value in self.options().items() if (name, value) != ("max_gap", Reading.max_gap)}
+
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `gyrostab.run.load_log`."""
         chosen = {

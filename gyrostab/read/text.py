@@ -31,7 +31,7 @@ from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
 from gyrostab.threads import in_order
 
-__all__ = ["matches", "read", "scan"]
+__all__ = ["matches", "read", "read_head", "scan"]
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 #: Bytes of the file in which the layout is looked for; more, up to the second number, where they hold fewer lines than the third.
@@ -148,6 +148,14 @@ def _holds_text(path: Path) -> bool:
 
 def _open(path: Path) -> IO[bytes]:
     return cast(IO[bytes], gzip.open(path, "rb")) if _gzipped(path) else path.open("rb")
+
+
+def read_head(path: Path) -> str:
+    """The first characters of a text file, plain or gzipped; nothing of other files."""
+    if not path.is_file() or not _holds_text(path):
+        return ""
+    with _open(path) as file:
+        return file.read(4096).decode("latin-1")
 
 
 def _chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:

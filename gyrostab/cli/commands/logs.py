@@ -13,7 +13,9 @@ __all__ = ["ingest", "scan"]
 
 @app.command(sort_key=1, help_epilogue="")
 def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common()) -> None:
-    """Say what is in some logs: span, sampling rate, axes, channels, gaps, and what is odd.
+    """Say what is in some logs: span, sampling rate, axes, channels, gaps, what is odd, and the command to run next.
+
+    A file that cannot be read as it is needs no options here: every column of it is shown, with a guess at the gyro, its unit and the time.
 
     Example: gyrostab scan run7/*.csv
 
@@ -22,12 +24,25 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     logs
         One or more logs, in any format that gyrostab reads.
     """
-    from gyrostab.scan import print_scan
-    from gyrostab.scan import scan as scan_logs
+    from gyrostab.scan import examine, next_command, print_look, print_next, print_scan
 
-    table = scan_logs(logs, **reading.options())
-    print_scan(table)
+    options = reading.given()
+    examined = examine(logs, **options)
+    table = examined.table
     lost = table[table["format"].isna()]
+    if len(lost) == len(table):
+        raise examined.errors[0]
+    print_scan(table)
+    readable = table[table["rate_hz"].notna()]
+    if len(readable):
+        span = (readable["end"].max() - readable["start"].min()).total_seconds()
+        print_next(next_command(list(readable["file"]), options, span), apart=True)
+    for found in examined.looks:
+        print_look(found)
+        if found.row is not None:
+            print_next(next_command(found.paths, found.options, found.row["span_s"] * len(found.paths)))
+    if options and examined.errors:
+        raise examined.errors[0]
     if len(lost):
         raise FormatError(f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; the table says why")
 
