@@ -24,6 +24,8 @@ MOST_COLUMNS = 100
 CHUNK_ROWS = 2**18
 #: Share of whole numbers above which a column is of counts: junk in the first rows makes no difference.
 WHOLE_SHARE = 0.999
+#: Numbers of this size are fillers: the squares of smaller ones can be summed.
+MOST_SIZE = 1e100
 #: Blocks of a chunk in which the mean step is taken.
 PACES = 64
 # Median of |x - y| of two normal values with one standard deviation: sqrt(2) times 0.6745, the upper quartile of the normal law.
@@ -148,7 +150,7 @@ def _chunks(variable: xr.DataArray) -> Iterator[NDArray[np.float64]]:
     dim = str(variable.dims[0])
     for start in range(0, variable.size, CHUNK_ROWS):
         values = np.asarray(variable.isel({dim: slice(start, start + CHUNK_ROWS)}).values, dtype=np.float64)
-        yield values[np.isfinite(values)]
+        yield values[np.abs(values) < MOST_SIZE]
 
 
 def _look(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnLook:
