@@ -13,6 +13,7 @@ import xarray as xr
 from gyrostab.clock import time_of_day
 from gyrostab.errors import TimeError, UnitError
 from gyrostab.gaps import gap_variables, name_lost, stamp_text
+from gyrostab.join.axes import group_axes
 from gyrostab.join.channels import join_channels
 from gyrostab.join.gaps import join_gaps
 from gyrostab.join.grid import Piece, Source, log_span, source_of
@@ -26,6 +27,9 @@ from gyrostab.timegrid import grid_times, time_coordinate
 from gyrostab.windows import duration_seconds
 
 __all__ = ["join_logs", "log_span"]
+
+#: Share of a log without an axis that other logs hold, from which a note says so; recorders are started one after the other.
+_NOTED_SHARE = 0.01
 
 #: What the clocks of two loggers, or of one that is now hot and now cold, may differ by; more is another rate.
 RATE_TOLERANCE = 1e-4
@@ -59,7 +63,8 @@ def join_logs(
     -------
     xarray.Dataset
         One regular log on the grid of the first: a sample of another log takes the nearest sample of the grid. Of samples that two
-        logs have, that of the earlier counts, where it is not NaN. Axes and channels that a log lacks are NaN there. The table of gaps
+        logs have, that of the earlier counts, where it is not NaN. Logs that hold other axes over the same time are put side by side.
+        Axes and channels that a log lacks are NaN there. The table of gaps
         holds those of the logs and those between them. The signal is one dask task for each chunk.
 
     Raises
@@ -150,11 +155,27 @@ def _signal_attributes(sources: Sequence[Source], name: str) -> dict[str, Any]:
 
 
 def _absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
-    """Sentences on axes and channels that some of the logs lack."""
-    names = {f"axis {axis}": [s.name for s in sources if axis not in s.axes] for axis in axes}
+    """Sentences on axes and channels that some of the logs lack; logs of other axes are not expected to have them."""
+    groups = [[sources[number] for number in group] for group in group_axes([source.axes for source in sources])]
+    names = {f"axis {axis}": _lacking(groups, [s for s in sources if axis in s.axes]) for axis in axes}
     for channel in dict.fromkeys(name for source in sources for name in log_channels(source.log)):
-        names[f"channel {channel}"] = [source.name for source in sources if channel not in source.log]
+        names[f"channel {channel}"] = _lacking(groups, [source for source in sources if channel in source.log])
     return [f"{what} is not in {some(files)} and is missing there" for what, files in names.items() if files]
+
+
+def _lacking(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:
+    """Name the logs that lack something, unless they hold other axes over the time that the holders span."""
+    if not holders:
+        return []
+    first, last = min(holder.start for holder in holders), max(holder.end for holder in holders)
+    names = []
+    for group in groups:
+        is_same = any(source in holders for source in group)
+        for source in group:
+            absent = max(first - source.start, 0) + max(source.end - last, 0)
+            if source not in holders and (is_same or absent > _NOTED_SHARE * (source.end - source.start)):
+                names.append(source.name)
+    return names
 
 
 def _attributes(sources: Sequence[Source], size: int, notes: Sequence[str]) -> dict[str, Any]:

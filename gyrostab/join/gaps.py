@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.gaps import CAUSE, END, FIRST, SAMPLES, thinned
+from gyrostab.join.axes import group_axes
 from gyrostab.join.grid import Piece
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.timegrid import grid_index
@@ -62,7 +64,7 @@ def _both(held: Table, new: Table) -> Table:
 
 
 def join_gaps(pieces: Sequence[Piece]) -> Table:
-    """The table of gaps of the joined log.
+    """Return the table of gaps of the joined log; what is missing in some axes only is a gap as well.
 
     Parameters
     ----------
@@ -74,10 +76,23 @@ def join_gaps(pieces: Sequence[Piece]) -> Table:
     ndarray of int64, shape (n, 5)
         Columns of `gyrostab.gaps.COLUMNS`, sorted by sample.
     """
+    groups = [[pieces[number] for number in group] for group in group_axes([piece.source.axes for piece in pieces])]
+    spans = sorted((min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups)
+    if len(groups) == 1 or any(later[0] >= earlier[1] for earlier, later in pairwise(spans)):
+        table = thinned(_join_group(pieces, pieces[0].first, None))  # the same axes, or others at another time
+    else:
+        end = max(end for _, end in spans)
+        tables = [_join_group(group, spans[0][0], end) for group in groups]
+        table = thinned(np.unique(np.concatenate(tables), axis=0))  # a gap of several axes is one line
+    return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
+
+
+def _join_group(pieces: Sequence[Piece], begin: int, stop_at: int | None) -> Table:
+    """Return the gaps of logs that have axes in common, from sample `begin` on and up to `stop_at` if it is given."""
     tables: list[Table] = []
     firsts: list[int] = []
     ends: list[int] = []
-    end = pieces[0].first
+    end = begin
     for piece in pieces:
         new = _own_gaps(piece)
         tables.append(new)
@@ -94,5 +109,6 @@ def join_gaps(pieces: Sequence[Piece]) -> Table:
         firsts.append(min(piece.first, end))
         ends.append(piece.end)
         end = max(end, piece.end)
-    table = thinned(np.concatenate([*tables, _NONE]))
-    return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
+    if stop_at is not None and stop_at > end:
+        tables.append(np.array([[end, stop_at, stop_at - end, 0, _MISSING]], dtype=np.int64))
+    return np.concatenate([*tables, _NONE])

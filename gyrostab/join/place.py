@@ -166,8 +166,8 @@ def _next(pieces: list[Piece], source: Source, rate: float, max_gap: float, cach
     differing: tuple[Piece, _Match] | None = None
     silent: tuple[Piece, _Match] | None = None
     for held in reversed(pieces):
-        if held.source.end < source.start:
-            continue
+        if held.source.end < source.start or not set(held.source.axes) & set(source.axes):
+            continue  # other axes over the same time are no overlap
         lag = _lag(held.source, source)
         match = _match(held.source, source, lag, cache)
         if match.alike:

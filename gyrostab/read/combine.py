@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
-from gyrostab.join import some, together
+from gyrostab.join import group_axes, some, split_axes, together
 from gyrostab.read.buffers import CHUNK_ROWS, lazily, pieces_of
-from gyrostab.read.overlap import drop_repeats
-from gyrostab.read.pieces import Pieces, Spool
+from gyrostab.read.overlap import drop_repeats, stamp_span
+from gyrostab.read.pieces import Blank, Pieces, Spool
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store import common_packing
 from gyrostab.store.direct import end_to_end, one_row, stack_rows
@@ -59,13 +60,14 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     if len(parts) == 1:
         joined = parts[0]
     else:
-        whole = _in_order(parts)
+        whole = _in_order([group for part in parts for group in split_axes(part)])
         signal = _signal(whole)
         own = [_off_rows(part) for part in whole]
         ordered = [part.drop_vars([*names, *(f"time_{name}" for name in names)]) for part, names in zip(whole, own, strict=True)]
+        groups = _group_by_axes(ordered)
         if "time" in ordered[0].variables:
-            ordered = drop_repeats(ordered)
-        joined = _join(ordered, signal)
+            groups = [drop_repeats(group) for group in groups]
+        joined = _join([part for group in groups for part in group], signal, groups)
         apart = [part[names] for part, names in zip(whole, own, strict=True) if names]
         joined = with_channels(joined, apart)
     if joined.sizes["row"] < 2:
@@ -77,6 +79,23 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 def _off_rows(part: xr.Dataset) -> list[str]:
     """Channels that have a time of their own."""
     return [str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)]
+
+
+def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
+    """Put files that have no axis in common, but the same time, into groups of their own; otherwise all are one group."""
+    groups = [[parts[number] for number in group] for group in group_axes([_axes(part) for part in parts])]
+    if len(groups) == 1 or not all(_axes(group[0]) for group in groups):
+        return [list(parts)]
+    if "time" not in parts[0].variables:
+        return groups
+    spans = [[stamp_span(part) for part in group] for group in groups]
+    ends = sorted((min(first for first, _ in span), max(last for _, last in span)) for span in spans)
+    in_time = [later[0] > earlier[1] for earlier, later in pairwise(ends)]  # one begins after the other has ended
+    return [list(parts)] if any(in_time) else groups
+
+
+def _axes(part: xr.Dataset) -> list[str]:
+    return [str(axis) for axis in part["axis"].values] if "axis" in part.coords else []
 
 
 def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
@@ -109,7 +128,7 @@ def _signal(parts: Sequence[xr.Dataset]) -> str | None:
     return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
 
 
-def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
+def _join(parts: list[xr.Dataset], signal: str | None, groups: list[list[xr.Dataset]]) -> xr.Dataset:
     sizes = [part.sizes["row"] for part in parts]
     names = [part.attrs["source_files"][0] for part in parts]
     absent: dict[str, list[str]] = {}
@@ -121,7 +140,7 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
         axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
         stack = _stacked(parts, signal, axes)
         for axis in axes:
-            absent[f"axis {axis}"] = [name for name, part in zip(names, parts, strict=True) if axis not in part["axis"].values]
+            absent[f"axis {axis}"] = _lacking(groups, lambda part, axis=axis: axis in _axes(part))  # type: ignore[misc]
         packing = common_packing(part[signal].encoding for part in parts)
         data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]}, packing)
         coords["axis"] = np.array(axes, dtype=str)
@@ -130,7 +149,7 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
         columns = [part[channel].data if channel in part else np.full(size, np.nan) for part, size in zip(parts, sizes, strict=True)]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
         data[channel] = ("row", end_to_end(columns, CHUNK_ROWS), {"units": units}, packing)
-        absent[f"channel {channel}"] = [name for name, part in zip(names, parts, strict=True) if channel not in part]
+        absent[f"channel {channel}"] = _lacking(groups, lambda part, name=channel: name in part)  # type: ignore[misc]
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     gaps = [f"{what} is not in {some(files)} and is missing there" for what, files in absent.items() if files]
     joined.attrs.update(
@@ -140,7 +159,17 @@ def _join(parts: list[xr.Dataset], signal: str | None) -> xr.Dataset:
         unreadable_rows=sum(part.attrs["unreadable_rows"] for part in parts),
         unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
     )
+    if len(groups) > 1:
+        ends = np.cumsum([0, *(sum(part.sizes["row"] for part in group) for group in groups)]).tolist()
+        axes_of = [sorted({axis for part in group for axis in _axes(part)}) for group in groups]
+        joined.attrs["axis_rows"] = [[axes, *rows] for axes, rows in zip(axes_of, pairwise(ends), strict=True)]
     return joined
+
+
+def _lacking(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], bool]) -> list[str]:
+    """Name the files that lack something which others of their group have; those of other groups hold other axes."""
+    found = [(str(part.attrs["source_files"][0]), has(part)) for group in groups if any(map(has, group)) for part in group]
+    return [name for name, is_there in found if not is_there]
 
 
 def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
@@ -159,7 +188,7 @@ def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
 def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
     if axis in part["axis"].values:
         return one_row(part[signal].data, [str(name) for name in part["axis"].values].index(axis))
-    return np.full(part.sizes["row"], np.nan)
+    return lazily(Pieces(np.float64, [Blank(part.sizes["row"])]))
 
 
 def _channel_units(parts: list[xr.Dataset], channel: str) -> str:

@@ -267,6 +267,26 @@ class Stored:
         return self
 
 
+@dataclass(frozen=True)
+class Blank:
+    """Rows without a value; they take no room."""
+
+    rows: int
+    held: int = 0
+
+    def fill(self, first: int, out: NDArray[Any]) -> None:
+        """Put NaN into `out`."""
+        out[:] = np.nan
+
+    def spilled(self, spool: Spool) -> Piece:
+        """Return the same."""
+        return self
+
+    def put(self, row: int, value: int) -> Piece:
+        """Return the same with another value in one row, by its bits."""
+        return _unpacked(self, np.float64).put(row, value)
+
+
 def _unpacked(piece: Piece, dtype: Any) -> Words:
     values = np.empty(piece.rows, dtype)
     piece.fill(0, values)

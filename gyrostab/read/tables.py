@@ -14,7 +14,7 @@ from gyrostab.errors import FormatError
 from gyrostab.read.arrays import read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
-from gyrostab.read.combine import with_channels
+from gyrostab.read.combine import concatenate, with_channels
 from gyrostab.read.options import FileSummary, ReadOptions
 
 __all__ = ["Table", "plain_names", "read_tables", "scan_tables"]
@@ -59,7 +59,7 @@ class _Planned:
     tables: list[Table]
     first: list[int]
     plan: Plan
-    main: int
+    main: list[int]  # tables with gyro axes; each has stamps of its own
 
     def part(self, place: int) -> tuple[Plan, Any]:
         """The plan of one table's columns, and how to fetch them."""
@@ -97,41 +97,41 @@ def _plan(path: Path, tables: Sequence[Table], options: ReadOptions) -> _Planned
     stamped = [begin for begin, table in zip(first, kept, strict=True) if table.stamps is not None and table.time_unit is None]
     plan = plan_columns(path, headers, options, units=units, stamped=stamped, coded=coded)
     wanted = plan.of("gyro") or plan.of("channel")
-    holders = {max(place for place, begin in enumerate(first) if begin <= column.source): column.header for column in wanted}
-    if plan.of("gyro") and len(holders) > 1:
-        names = " and ".join(repr(name) for name in list(holders.values())[:2])
-        raise FormatError(
-            f"{path.name}: the gyro axes {names} have different stamps; read them one by one, dropping the others (--map NAME=-)"
-        )
-    return _Planned(kept, first, plan, min(holders, default=0))
+    holders = {max(place for place, begin in enumerate(first) if begin <= column.source) for column in wanted}
+    return _Planned(kept, first, plan, sorted(holders) if plan.of("gyro") else [min(holders, default=0)])
 
 
 def scan_tables(path: Path, form: str, tables: Sequence[Table], options: ReadOptions, notes: Sequence[str] = ()) -> FileSummary:
     """A summary, with the first and last stamps of the table of the gyro axes."""
     planned = _plan(path, tables, options)
-    plan, fetch = planned.part(planned.main)
-    summary = summarise(form, plan, options, planned.tables[planned.main].rows, fetch, notes)
-    return replace(summary, channels=tuple(column.name for column in planned.plan.of("channel")))
+    main = planned.main[0]
+    plan, fetch = planned.part(main)
+    summary = summarise(form, plan, options, planned.tables[main].rows, fetch, notes)
+    axes, channels = (tuple(column.name for column in planned.plan.of(role)) for role in ("gyro", "channel"))
+    return replace(summary, axes=axes, channels=channels)
 
 
 def read_tables(
     path: Path, tables: Sequence[Table], options: ReadOptions, *, notes: Sequence[str] = (), limit: int = SPILL_BYTES
 ) -> xr.Dataset:
-    """The raw log of the table with the gyro axes; channels of the other tables are on stamps of their own.
+    """Return the raw log of the tables with gyro axes; channels of the other tables are on stamps of their own.
 
     Raises
     ------
     FormatError
-        When there is nothing in the tables, or the gyro axes have different stamps.
+        When there is nothing in the tables.
     """
     planned = _plan(path, tables, options)
     planned.plan.check()
-    plan, fetch = planned.part(planned.main)
-    log = read_columns(plan, options, planned.tables[planned.main].rows, fetch, notes=notes, limit=limit)
-    others = []
+    main: list[xr.Dataset] = []
+    others: list[xr.Dataset] = []
     for place, table in enumerate(planned.tables):
         plan, fetch = planned.part(place)
-        if place != planned.main and plan.of("channel"):
+        if place in planned.main:
+            told = notes if not main else ()
+            main.append(read_columns(plan if not main else replace(plan, notes=()), options, table.rows, fetch, notes=told, limit=limit))
+        elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
             others.append(read_columns(plan, options, table.rows, fetch, limit=limit))
-    return with_channels(log, others)
+    log = with_channels(concatenate(main) if len(main) > 1 else main[0], others)
+    return log.assign_attrs(source_files=[path.name], row_start=[0]) if "axis_rows" not in log.attrs else log

@@ -17,6 +17,7 @@ from gyrostab.clock import time_of_day
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.gaps import gap_variables, name_lost
 from gyrostab.limits import check_limits
+from gyrostab.regularise.axes import regularise_axes
 from gyrostab.regularise.fill import gathered, on_grid
 from gyrostab.regularise.gaps import find_gaps, gap_table
 from gyrostab.regularise.notes import describe, describe_channels, describe_rate
@@ -202,6 +203,9 @@ def regularise(
         return raw
     check_raw(raw)
     _checked(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
+    if "axis_rows" in raw.attrs:
+        each = partial(regularise, rate=rate, tolerance=tolerance, max_gap=max_gap, chunk=chunk, block=block, limits=limits)
+        return regularise_axes(raw, each, max_gap=max_gap, limits=limits)
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     allowed = check_limits(limits)

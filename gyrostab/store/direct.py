@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Fill", "can_fill", "end_to_end", "fill_row", "held", "one_row", "stack_rows", "stretch", "with_fill"]
+__all__ = ["Fill", "can_fill", "cut", "end_to_end", "fill_row", "held", "one_row", "stack_rows", "stretch", "with_fill"]
 
 #: ``fill(row, begin, out)`` puts the samples of a row from `begin` on into `out`; the row of an array of one dimension is 0.
 Fill = Callable[[int, int, NDArray[Any]], None]
@@ -123,3 +123,13 @@ def one_row(array: Any, row: int) -> Any:
 
 def _fill_of(array: Any, row: int, _row: int, begin: int, out: NDArray[Any]) -> None:
     fill_row(array, row, begin, out)
+
+
+def cut(array: Any, begin: int, end: int) -> Any:
+    """Return samples `begin` to `end` of an array, along its last dimension, read directly where the whole can be."""
+    part = array[..., begin:end]
+    return with_fill(part, partial(_fill_cut, array, begin)) if hasattr(array, "gyrostab_fill") else part
+
+
+def _fill_cut(array: Any, first: int, row: int, begin: int, out: NDArray[Any]) -> None:
+    fill_row(array, row, first + begin, out)

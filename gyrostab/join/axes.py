@@ -1,0 +1,88 @@
+"""Logs that hold some of the axes of a recording: which belong together, and a raw log taken apart by its axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import SchemaError
+from gyrostab.schema import signal_name, texts
+from gyrostab.store.direct import cut, one_row, stack_rows
+
+__all__ = ["group_axes", "split_axes"]
+
+
+def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
+    """Group logs by the axes they hold: logs of one group have axes in common, directly or through others.
+
+    Parameters
+    ----------
+    axes : sequence of sequence of str
+        The axes of each log.
+
+    Returns
+    -------
+    list of list of int
+        Positions of the logs of each group; the groups by their first axis.
+
+    Examples
+    --------
+    >>> group_axes([["z"], ["x", "y"], ["z"], ["y"]])
+    [[1, 3], [0, 2]]
+    """
+    groups: list[tuple[set[str], list[int]]] = []
+    for number, own in enumerate(axes):
+        near = [group for group in groups if group[0] & set(own)]
+        groups = [group for group in groups if group not in near]
+        members = sorted([number, *(other for group in near for other in group[1])])
+        groups.append((set(own).union(*(group[0] for group in near)), members))
+    return [members for _, members in sorted(groups, key=lambda group: sorted(group[0]))]
+
+
+def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
+    """Split a raw log whose axes have stamps of their own into raw logs that do not, as lazy as the whole.
+
+    Parameters
+    ----------
+    raw : xarray.Dataset
+        Raw log; its attribute ``axis_rows`` lists axes, first row and row after the last of each group.
+
+    Returns
+    -------
+    list of xarray.Dataset
+        One raw log for each group; the log itself where the attribute is missing.
+
+    Raises
+    ------
+    SchemaError
+        When rows were taken out of the log after it was read.
+    """
+    groups = raw.attrs.get("axis_rows")
+    if groups is None:
+        return [raw]
+    parts = []
+    if int(groups[-1][2]) != raw.sizes["row"]:
+        raise SchemaError("the rows of this raw log were selected after it was read; regularise the whole, and select from the regular log")
+    name = signal_name(raw)
+    signal, places = raw[name], [str(axis) for axis in raw["axis"].values]
+    files = list(zip(texts(raw, "source_files"), np.atleast_1d(raw.attrs["row_start"]).tolist(), strict=True))
+    for number, (axes, first, end) in enumerate(groups):
+        rows = [cut(one_row(signal.data, places.index(axis)), first, end) for axis in axes]
+        stacked = np.stack(rows) if isinstance(rows[0], np.ndarray) else stack_rows(rows)
+        data: dict[Any, Any] = {name: (("axis", "row"), stacked, signal.attrs, signal.encoding)}
+        for key, variable in raw.data_vars.items():
+            if key != name and (variable.dims == ("row",) or number == 0):
+                kept = cut(variable.data, first, end) if variable.dims == ("row",) else variable.data
+                data[key] = (variable.dims, kept, variable.attrs, variable.encoding)
+        coords = {str(key): raw[key].variable for key in raw.coords if str(key).startswith("time_") and number == 0}
+        if "time" in raw.variables:
+            coords["time"] = xr.Variable("row", cut(raw["time"].data, first, end))
+        own = [(file, start - first) for file, start in files if first <= start < end]
+        attrs = {key: value for key, value in raw.attrs.items() if key != "axis_rows"}
+        attrs |= {"source_files": [file for file, _ in own], "row_start": [start for _, start in own]}
+        attrs |= {} if number == 0 else {"notes": [], "history": "", "unreadable_rows": 0, "unreadable_cells": 0}
+        parts.append(xr.Dataset(data, {"axis": axes, **coords}, attrs))
+    return parts
