@@ -25,8 +25,6 @@ __all__ = ["COLUMNS", "Examined", "Look", "examine", "next_command", "print_look
 
 #: Share of missing samples above which the sampling rate may be wrong: it is then tried with the mean rate of the rows.
 MUCH_MISSING = 0.1
-#: Default of ``gyrostab run --window`` [s].
-DEFAULT_WINDOW_S = 600.0
 
 #: Columns of the table; span in s, rate in Hz, missing as a share of the samples between start and end.
 COLUMNS = ("file", "format", "start", "end", "span_s", "rate_hz", "axes", "channels", "rows", "gaps", "missing_share", "odd")
@@ -191,7 +189,7 @@ def _named_rate(path: Path) -> float | None:
     return rate or None
 
 
-def next_command(paths: Sequence[str | Path], options: dict[str, Any], span_s: float) -> str:
+def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
     """The complete command that makes a product of logs.
 
     Parameters
@@ -200,12 +198,10 @@ def next_command(paths: Sequence[str | Path], options: dict[str, Any], span_s: f
         The logs.
     options : dict
         Options of reading, as `scan` takes them.
-    span_s : float
-        Length of the record [s]; a short one needs a shorter window than the default.
 
     Examples
     --------
-    >>> next_command(["run 7.csv"], {"map": {"wx": "gyro_x"}, "unit": {"gyro": "deg/s"}}, 3600.0)
+    >>> next_command(["run 7.csv"], {"map": {"wx": "gyro_x"}, "unit": {"gyro": "deg/s"}})
     "gyrostab run 'run 7.csv' -o product.nc --map wx=gyro_x --unit gyro=deg/s"
     """
     number, target = 2, Path("product.nc")
@@ -224,8 +220,6 @@ def next_command(paths: Sequence[str | Path], options: dict[str, Any], span_s: f
             words.append(flag)
         else:
             words += [flag, f"{value:.10g}" if isinstance(value, float) else str(value)]
-    if span_s < DEFAULT_WINDOW_S:
-        words += ["--window", f"{max(1, math.floor(span_s / 4))}s" if span_s >= 4 else f"{math.floor(span_s * 250)}ms"]
     return shlex.join(words)
 
 

@@ -138,6 +138,21 @@ def test_a_matlab_table_saved_as_structures_is_read(tmp_path: Path) -> None:
     assert raw.rate[0].values.tolist() == [0, 2, 4]
 
 
+def test_fields_of_a_structure_are_known_by_their_own_names(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    time, rates = np.arange(5) / 10, np.arange(15.0).reshape(3, 5)
+    fields = {"time_ms": time * 1e3, "temperature": 20 + time, **dict(zip(("gyro_x", "gyro_y", "gyro_z"), rates, strict=True))}
+    savemat(tmp_path / "s.mat", {"S": fields})
+    raw = read_log(tmp_path / "s.mat", unit={"gyro": "deg/h", "temperature": "degC"})
+    assert np.array_equal(raw.rate.values, rates)
+    assert np.diff(raw.time.values).astype(np.int64).tolist() == [10**8] * 4
+    assert np.allclose(raw.temperature.values, 20 + time)
+    savemat(tmp_path / "two.mat", {"a": fields, "b": fields})
+    with pytest.raises(FormatError, match=r"a\.gyro_x, "):
+        read_log(tmp_path / "two.mat", unit={"gyro": "deg/h"})
+
+
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [

@@ -221,7 +221,7 @@ def _pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
     """``["wx=gyro_x"]`` as a dict; an item may also name a TOML file of such pairs."""
     found: dict[str, str] = {}
     for item in items or ():
-        name, equals, value = item.partition("=")
+        name, equals, value = item.rpartition("=")  # a header may hold the sign, a name or a unit does not
         if equals and name.strip() and value.strip():
             found[name.strip()] = value.strip()
         elif item.endswith(".toml"):

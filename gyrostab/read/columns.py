@@ -144,7 +144,7 @@ def plan_columns(
         told = f", and {rate:g} Hz by the lines above the header" if rate else ""
         work.notes.insert(0, f"read as a file of {preset.name}{told}; --map, --unit and --rate overrule it")
     elif found := [f"{c.header} is {c.name}" for c in named if c.preset and AXIS.match(c.low)]:
-        work.notes.append(f"rotation by their codes: {_listing(found)}; --map overrules it")
+        work.notes.append(f"taken for axes: {_listing(found)}; --map overrules it")
     if time is None and options.rate is None and rate is None and not work.problems:
         message = f"{path.name}: there is no time column; give the sampling rate with --rate HZ (and --start)"
         work.problems.append(OptionError(f"{message}, or name the column: --map NAME=time. Columns: {_listing(headers)}"))

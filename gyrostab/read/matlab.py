@@ -6,7 +6,7 @@ The rows of a matrix run along its longer side. Fields of a structure are called
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,7 @@ from gyrostab.limits import check_chunk, check_stored
 from gyrostab.read.arrays import Fetch, float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
+from gyrostab.read.headers import AXIS, KNOWN, TIME, is_time_unit
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.packing import ATTRIBUTES, fold_packing, text_attributes
 from gyrostab.store.rows import LibraryRows, Rows, hdf5_rows
@@ -88,9 +89,22 @@ def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vec
         notes.append(f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to keep it, {_PLAIN_ARRAYS}")
     attributes = [_attributes(vector.array) for vector in kept]
     units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
-    plan = plan_columns(path, [vector.header for vector in kept], options, units=units, calendars=calendars)
+    headers = [vector.header for vector in kept]
+    plan = plan_columns(path, headers, options, units=units, calendars=calendars, coded=_known_fields(headers))
     plan, decoders = fold_packing(plan, [vector.array.dtype for vector in kept], attributes)
     return kept, plan, lambda source, start, stop: decoders[source](kept[source].stored.read(start, stop)), notes
+
+
+def _known_fields(headers: Sequence[str]) -> dict[int, str]:
+    """Fields of structures whose own names are ours, ``gyro_x`` of ``S.gyro_x``, where no other field has that name."""
+    names = [header.rpartition(".")[2] for header in headers]
+    times = [place for place, name in enumerate(names) if TIME.match(name.lower())]
+    found = {place: name.lower() for place, name in enumerate(names) if AXIS.match(name.lower()) or KNOWN.match(name.lower())}
+    found = {place: name for place, name in found.items() if list(found.values()).count(name) == 1}
+    if len(times) == 1:
+        suffix = next((text for text in TIME.match(names[times[0]].lower()).groups() if text), None)  # type: ignore[union-attr]
+        found[times[0]] = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
+    return {place: name for place, name in found.items() if "." in headers[place]}
 
 
 def _attributes(array: Any) -> dict[str, Any]:

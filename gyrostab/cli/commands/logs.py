@@ -35,12 +35,11 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     print_scan(table)
     readable = table[table["rate_hz"].notna()]
     if len(readable):
-        span = (readable["end"].max() - readable["start"].min()).total_seconds()
-        print_next(next_command(list(readable["file"]), options, span), apart=True)
+        print_next(next_command(list(readable["file"]), options), apart=True)
     for found in examined.looks:
         print_look(found)
         if found.row is not None:
-            print_next(next_command(found.paths, found.options, found.row["span_s"] * len(found.paths)))
+            print_next(next_command(found.paths, found.options))
     if options and examined.errors:
         raise examined.errors[0]
     if len(lost):
