@@ -167,3 +167,17 @@ def test_another_time_column_can_be_named(tmp_path: Path) -> None:
     path = write(tmp_path, "Time [s],Time::TimeStartup [ns],gyro_x [deg/h]\n0,0,1\n1,2000000000,2\n")
     assert seconds(read_log(path)) == [0, 1]
     assert seconds(read_log(path, map={"Time::TimeStartup": "time"})) == [0, 2]
+
+
+def test_durations_as_matlab_writes_them_are_the_time(tmp_path: Path) -> None:
+    rows = "".join(f"{n / 100:g} sec,{n},20\n" for n in range(300))
+    raw = read_log(write(tmp_path, "Time,gyro_x,T\n" + rows), unit={"gyro": "deg/h"})
+    assert seconds(raw) == [n / 100 for n in range(300)]
+    assert raw.rate[0].values.tolist() == list(range(300))
+    assert raw.attrs["unreadable_rows"] == 0
+
+
+def test_aligned_columns_without_a_header_are_mapped_by_number(tmp_path: Path) -> None:
+    rows = "".join(f"{n / 100:12.4f}{n:10.3f}{-n:10.3f}   \n" for n in range(5))
+    raw = read_log(write(tmp_path, rows, "log.txt"), map={"0": "time [s]", "1": "gyro_x [deg/h]", "2": "gyro_y [deg/h]"})
+    assert raw.rate.values.tolist() == [[0, 1, 2, 3, 4], [0, -1, -2, -3, -4]]

@@ -238,4 +238,7 @@ def _cell_stamps(rows: list[list[str] | None], typing: Typing) -> NDArray[np.int
     cells = ["" if row is None else row[typing.time] for row in rows]
     if typing.layout.decimal_comma:
         cells = [cell.replace(",", ".") for cell in cells]
+    if typing.unit is not None:
+        suffix = f" {typing.unit.text}"  # durations as MATLAB writes them
+        cells = [cell.strip().removesuffix(suffix) for cell in cells]
     return cells_to_ns(cells, typing.unit, typing.options.epoch_ns)

@@ -13,7 +13,7 @@ from gyrostab.errors import FormatError
 from gyrostab.limits import check_columns
 from gyrostab.read.stamps import looks_iso
 
-__all__ = ["BLANK", "Layout", "find_layout", "is_number", "is_text", "split_line"]
+__all__ = ["BLANK", "Layout", "find_layout", "is_number", "is_text", "split_line", "unit_of_duration"]
 
 #: Stands for any run of blanks as the separator.
 BLANK = " "
@@ -23,6 +23,7 @@ MOST_LINES = 2 * HEAD_LINES + 20
 
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
 _HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\]]*\])?(?:[ \t]+\[[^\]]*\])?)")
+_DURATION = re.compile(r"^\s*[+-]?\d+(?:\.\d+)? (ms|s|sec|min|h|hr|d|day|days)\s*$")
 _COMMENT = re.compile(r"^\s*[#%]")
 
 
@@ -52,6 +53,12 @@ def is_number(text: str, *, comma: bool = False) -> bool:
     """Whether a cell holds a plain decimal number (no words, no ``nan``)."""
     text = text.strip()
     return bool(_NUMBER.match(text.replace(",", ".") if comma else text))
+
+
+def unit_of_duration(text: str) -> str | None:
+    """The unit of a cell such as ``0.01 sec``, as MATLAB writes durations; None for other cells."""
+    match = _DURATION.match(text)
+    return match.group(1) if match else None
 
 
 def is_text(head: bytes) -> bool:
@@ -155,7 +162,7 @@ def _is_data(cells: list[str], *, comma: bool) -> bool:
     """Whether a row is data: a number or date somewhere, and no cell that looks like a name."""
     void = ("", "nan", "-nan", "inf", "-inf", "null", "na", "n/a", "none")
     solid = [cell for cell in cells if cell.lower() not in void and not set(cell) <= set("*-")]
-    values = [cell for cell in solid if is_number(cell, comma=comma) or looks_iso(cell)]
+    values = [cell for cell in solid if is_number(cell, comma=comma) or looks_iso(cell) or unit_of_duration(cell)]
     return (
         bool(values)
         and 2 * len(values) >= len(solid)

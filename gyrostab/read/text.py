@@ -26,7 +26,7 @@ from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.cells import VOID, Typing, parse_cells, parse_fast, parse_plain, stamp_types
 from gyrostab.read.columns import Column, Plan, plan_columns
 from gyrostab.read.intake import Intake, Taken, summary_of
-from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line
+from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line, unit_of_duration
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
 from gyrostab.threads import in_order
@@ -100,12 +100,20 @@ def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         path,
         layout.headers,
         options,
+        units=_durations(layout),
         stamped=stamped,
         rising=partial(_rises, layout),
         above=layout.above,
         is_filled=lambda column: any(row[column].strip() not in VOID for row in layout.samples if len(row) == layout.width),
     )
     return layout, plan
+
+
+def _durations(layout: Layout) -> dict[int, str]:
+    """The units of columns whose cells carry them, ``0.01 sec``."""
+    rows = [row for row in layout.samples if len(row) == layout.width]
+    found = {column: unit for column, cell in enumerate(rows[0]) if (unit := unit_of_duration(cell))} if rows else {}
+    return {column: unit for column, unit in found.items() if all(unit_of_duration(row[column]) == unit for row in rows)}
 
 
 def _rises(layout: Layout, column: int) -> bool:
