@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 import tracemalloc
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import h5py
 import netCDF4
 import numpy as np
 import pytest
+import xarray as xr
 import zarr
 
 from gyrostab import davar, make_log, read_log, regularise, scan, to_netcdf, to_zarr
@@ -20,6 +22,8 @@ from gyrostab.limits import check_limits
 from gyrostab.read import ReadOptions, arrays, matlab
 from gyrostab.read import netcdf as netcdf_reader
 from gyrostab.read.pieces import Spool
+
+regularise_module = sys.modules["gyrostab.regularise"]  # the package has a function of that name
 
 
 def write_stamped_netcdf(path: Path, rows: int) -> Path:
@@ -314,3 +318,49 @@ def test_line_of_a_wide_table_is_longer_than_the_usual_head(tmp_path: Path) -> N
     path = write_wide_csv(tmp_path / "log.csv", "a_long_name_of_a_channel_{}", 9000)
     assert path.read_text().index("\n") > 2**17
     assert read_log(path).sizes["row"] == 6
+
+
+def write_gappy_netcdf(path: Path, rows: int, stamps: np.ndarray) -> Path:
+    """A CF file with lost rows, missing cells of one axis, and a channel that is filled in every tenth row."""
+    draw = np.random.default_rng(6)
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("time", rows)
+        for name in ("time", "gyro_x", "gyro_y", "temperature"):
+            variable = file.createVariable(name, "i8" if name == "time" else "f8", ("time",))
+            values = stamps if name == "time" else draw.normal(size=rows)
+            if name.startswith("gyro"):
+                values[3000:3100] = np.nan
+            if name == "gyro_y":
+                values[1000:1016] = np.nan
+                values[rows - 5] = np.inf
+            if name == "temperature":
+                values[np.arange(rows) % 10 > 0] = np.nan
+            variable.units = {"time": SINCE, "temperature": "degC"}.get(name, "deg/h")
+            variable[:] = values
+    return path
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_log_of_values_that_stay_in_the_file_is_the_log_of_values_in_memory(
+    even: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(arrays, "BATCH_ROWS", 1024)
+    stamps = START_NS + np.arange(20_000) * 2_500_000
+    stamps[10_000:] += 0 if even else 7_500_000
+    path = write_gappy_netcdf(tmp_path / "log.nc", 20_000, stamps)
+    whole, lazy = (regularise(netcdf_reader.read(path, ReadOptions(), limit=limit)) for limit in (2**27, 1000))
+    xr.testing.assert_identical(whole.drop_attrs(deep=False), lazy.load().drop_attrs(deep=False))
+    assert whole.attrs["notes"] == lazy.attrs["notes"]
+
+
+def test_even_stamps_are_placed_by_a_look_at_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(regularise_module, "_EVEN_ROWS", 2**14)
+    path = write_stamped_netcdf(tmp_path / "log.nc", 100_000)
+    whole, lazy = (netcdf_reader.read(path, ReadOptions(), limit=limit) for limit in (2**27, 1000))
+    seen = []
+    rate = regularise_module.estimate_rate
+    monkeypatch.setattr(regularise_module, "estimate_rate", lambda stamps, **where: seen.append(list(stamps())) or rate(stamps, **where))
+    logs = [regularise(raw) for raw in (whole, lazy)]
+    assert [sum(len(rows) for rows, _ in blocks) for blocks in seen] == [100_000, 2**14]
+    xr.testing.assert_identical(logs[0].drop_attrs(deep=False), logs[1].load().drop_attrs(deep=False))
+    assert logs[0].attrs["sampling_rate_hz"] == logs[1].attrs["sampling_rate_hz"] == 400.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import xarray as xr
@@ -16,6 +16,7 @@ from gyrostab.read.intake import Intake, Taken, summary_of
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.pieces import Steps, Stored
 from gyrostab.read.stamps import NAT, cells_to_ns, dates_to_ns, floats_to_ns, integers_to_ns, looks_iso, signed_counts
+from gyrostab.store.seen import look_at_cells
 from gyrostab.threads import in_order
 
 __all__ = ["Fetch", "batch_rows", "convert_batch", "holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
@@ -111,9 +112,9 @@ def batch_rows(columns: int) -> int:
     Examples
     --------
     >>> batch_rows(4), batch_rows(1000)
-    (1048576, 8388)
+    (1048576, 8384)
     """
-    return int(np.clip(BATCH_BYTES // (8 * max(columns, 1)), 2**10, BATCH_ROWS))
+    return min(max(BATCH_BYTES // (8 * max(columns, 1)), 2**10), BATCH_ROWS) // 8 * 8
 
 
 def _take_rows(intake: Intake, plan: Plan, options: ReadOptions, fetch: Fetch, stay: bool, span: tuple[int, int]) -> Taken:
@@ -122,12 +123,16 @@ def _take_rows(intake: Intake, plan: Plan, options: ReadOptions, fetch: Fetch, s
     if not stay:
         return taken
     begin, rows = span[0], taken.rows
+    seen = None
+    if intake.gyro:
+        cells = np.stack([cast(NDArray[np.float64], taken.block[column.source]) for column in intake.gyro])
+        seen = look_at_cells(cells, {column.name: cast(NDArray[Any], taken.block[column.source]) for column in intake.channels}, begin)
     block: dict[int, Any] = {}
     for column in plan.columns:
         piece = taken.block[column.source]
         read = partial(_read_stamps if column.role == "time" else _read_values, column, options, fetch)
         block[column.source] = piece if isinstance(piece, Steps) else Stored(read, begin, rows)
-    return taken._replace(block=block)
+    return taken._replace(block=block, seen=seen)
 
 
 def _read_values(column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int) -> NDArray[np.float64]:

@@ -118,6 +118,7 @@ def lazily(values: NDArray[Any] | Pieces) -> Any:
     name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
     lazy = with_fill(dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta), values.fill)
     lazy.gyrostab_pieces = [values]
+    lazy.gyrostab_line = values.find_line()
     return lazy
 
 

@@ -16,6 +16,7 @@ from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.pieces import Counts, Piece, Pieces, Steps
 from gyrostab.read.stamps import NAT
 from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.store.seen import Seen, with_seen
 
 __all__ = ["Intake", "Taken", "summary_of"]
 
@@ -45,6 +46,8 @@ class Taken(NamedTuple):
         Cells that are unreadable, and gyro cells of `cell_rows`.
     low, high : int
         Range of the stamps of readable rows [ns since 1970]; the other way round where there are none.
+    seen : Seen or None
+        What a look at the values found, where they stay in the file.
     """
 
     rows: int
@@ -56,6 +59,7 @@ class Taken(NamedTuple):
     cells: int
     low: int
     high: int
+    seen: Seen | None = None
 
 
 _NO_ROWS = np.empty(0, np.int64)
@@ -96,6 +100,7 @@ class Intake:
         self.cell_places: list[str] = []
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
+        self.seen: list[Seen] = []
         self.whole: dict[int, tuple[float, float] | None] = {column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]}
 
     def prepare(self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0) -> Taken:
@@ -165,6 +170,7 @@ class Intake:
         if taken.cell_rows.size:
             self._note_cells(taken.cell_rows, taken.cells, locate)
         self.low, self.high = min(self.low, taken.low), max(self.high, taken.high)
+        self.seen += [taken.seen] if taken.seen is not None else []
         self.buffers.add(taken.block)
 
     def _convert(self, column: Column, values: NDArray[np.float64]) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
@@ -252,6 +258,7 @@ class Intake:
         if self.gyro and self.plan.signal is not None:
             axes = [column.name for column in self.gyro]
             stack = together([columns[column.source] for column in self.gyro])
+            stack = with_seen(stack, self.seen) if self.seen else stack
             data[self.plan.signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[self.plan.signal]}, self._packing(self.gyro))
             coords["axis"] = np.array(axes, dtype=str)
         for column in self.channels:

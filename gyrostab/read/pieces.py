@@ -315,6 +315,17 @@ class Pieces:
         """Bytes in memory."""
         return sum(piece.held for piece in self._pieces)
 
+    def find_line(self) -> tuple[int, int] | None:
+        """Return the first value and the step, where all values are even steps without a break; None where they are not."""
+        if not self._pieces or not all(isinstance(piece, Steps) and len(piece.table) == 1 for piece in self._pieces):
+            return None
+        _, first, step = (int(number) for number in self._pieces[0].table[0])  # type: ignore[attr-defined]
+        for row, piece in zip(self._rows, self._pieces, strict=False):
+            _, start, own = (int(number) for number in piece.table[0])  # type: ignore[attr-defined]
+            if start != first + row * step or (own != step and piece.rows > 1):
+                return None
+        return first, step
+
     def spill(self, spool: Spool) -> None:
         """Move what is in memory to a file."""
         self._pieces[:] = [piece.spilled(spool) for piece in self._pieces]

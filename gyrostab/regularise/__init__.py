@@ -27,12 +27,14 @@ from gyrostab.regularise.repeats import find_repeats, with_repeats
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name, texts
 from gyrostab.store import chunk_samples
-from gyrostab.timegrid import check_rate, check_span, stamp_ns, time_coordinate
+from gyrostab.store.direct import stretch
+from gyrostab.timegrid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
 from gyrostab.windows import duration_seconds
 
 __all__ = ["gap_table", "regularise"]
 
 _DISAGREE = 0.02  # a declared rate further off than this is a mistake
+_EVEN_ROWS = 2**18  # rows at the beginning of a log with even stamps that tell its rate
 _ROUNDS = 4  # a repetition within another shows only when the latter is gone
 _OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "history", "unreadable_spans")
 
@@ -94,6 +96,28 @@ def _place(
         odd = odd_stretches(stamps, 1e9 / rate)
     notes += describe_rate(raw, estimate, rate, odd, placement)
     return placement, rate
+
+
+def _place_even(raw: xr.Dataset, found: Survey, place: Callable[..., tuple[Placement, float]]) -> tuple[Placement, float] | None:
+    """Place the rows of a long log whose stamps are even steps of the sampling period, by a look at its beginning alone.
+
+    None where they are not, where a row has no sample, or where there is anything to be told of the beginning.
+    """
+    line: tuple[int, int] | None = getattr(raw["time"].data, "gyrostab_line", None) if "time" in raw.variables else None
+    if line is None or found.absent or found.repeated or found.rows <= _EVEN_ROWS:
+        return None
+    start, step = line
+    stamps = (start + step * np.arange(_EVEN_ROWS)).view("datetime64[ns]")
+    signal = signal_name(raw)
+    values = stretch(raw[signal].data, 0, _EVEN_ROWS)
+    head = xr.Dataset({signal: (("axis", "row"), values)}, {"time": ("row", stamps), "axis": raw["axis"].values}, raw.attrs)
+    present = replace(found, rows=_EVEN_ROWS, present=found.present[: _EVEN_ROWS // 8].copy())
+    notes: list[str] = []
+    placement, rate = place(head, present, notes=notes)
+    whole, fraction = period_ns(rate)
+    if notes or fraction or whole != step or placement.runs.tolist() != [[0, 0, _EVEN_ROWS]] or len(placement.events):
+        return None
+    return replace(placement, runs=np.array([[0, 0, found.rows]], dtype=np.int64)), rate
 
 
 def _place_once(raw: xr.Dataset, found: Survey, place: Callable[[], Placement]) -> Placement:
@@ -211,7 +235,8 @@ def regularise(
     allowed = check_limits(limits)
     found = survey(raw, name, block=block)
     notes: list[str] = []
-    placement, hertz = _place(raw, found, _declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block, notes=notes)
+    place = partial(_place, declared=_declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block)
+    placement, hertz = _place_even(raw, found, place) or place(raw, found, notes=notes)
     check_grid(raw, placement, hertz, gap_limit, allowed)
     check_span(placement.start, hertz, placement.size, file_of(raw)[0])
     chunk = chunk or chunk_samples(hertz)

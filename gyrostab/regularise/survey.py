@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.kernels.stamps import look
 from gyrostab.schema import texts
 from gyrostab.store.direct import stretch
+from gyrostab.store.seen import Seen, look_at_cells
 from gyrostab.threads import in_order
 
 __all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
@@ -68,11 +67,6 @@ class Survey:
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
-def _spans(bad: NDArray[np.bool_], offset: int) -> NDArray[np.int64]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
-    return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
-
-
 def _join(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     spans = np.concatenate([*parts, np.empty((0, 2), dtype=np.int64)])
     if len(spans) < 2:
@@ -83,30 +77,18 @@ def _join(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
 
 
-class _Seen(NamedTuple):
-    """What `survey` finds in one block."""
-
-    absent: int
-    bits: NDArray[np.uint8]
-    unreadable: NDArray[np.int64]
-    infinite: NDArray[np.int64]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    filled: list[int]
+def _look_at(raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]) -> Seen:
+    return look_at_cells(stretch(raw[name].data, *ends), {key: stretch(raw[key].data, *ends) for key in channels}, ends[0])
 
 
-def _look_at(raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]) -> _Seen:
-    begin, end = ends
-    cells = stretch(raw[name].data, begin, end)
-    present = np.empty(end - begin, dtype=bool)
-    missing, holes, infinities, low, high = look(np.ascontiguousarray(cells, dtype=np.float64), present)
-    unreadable = _spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NONE
-    infinite = _spans(np.isinf(cells).any(axis=0), begin) if infinities else _NONE
-    filled = [int(np.isfinite(stretch(raw[key].data, begin, end)).sum()) for key in channels]
-    return _Seen(missing, np.packbits(present), unreadable, infinite, low, high, filled)
-
-
-_NONE = np.empty((0, 2), dtype=np.int64)
+def _looks(raw: xr.Dataset, name: str, channels: Sequence[str], block: int) -> Iterable[Seen]:
+    """What is in each block, as the reader found it, or else by a look at it."""
+    rows = raw.sizes["row"]
+    seen: list[Seen] = getattr(raw[name].data, "gyrostab_seen", [])
+    whole = sum(one.rows for one in seen) == rows and all(one.rows % 8 == 0 for one in seen[:-1])
+    if seen and whole and all(one.filled.keys() == set(channels) for one in seen):
+        return seen
+    return in_order(partial(_look_at, raw, name, channels), ((at, min(rows, at + block)) for at in range(0, rows, block)))
 
 
 def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
@@ -125,14 +107,13 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
     low, high = np.full(n_axes, np.inf), np.full(n_axes, -np.inf)
     channels = [str(key) for key, variable in raw.data_vars.items() if variable.dims == ("row",)]
     filled = dict.fromkeys(channels, 0)
-    work = partial(_look_at, raw, name, channels)
-    for one in in_order(work, ((begin, min(rows, begin + block)) for begin in range(0, rows, block))):
+    for one in _looks(raw, name, channels, block):
         absent += one.absent
         bits.append(one.bits)
         unreadable.append(one.unreadable)
         infinite.append(one.infinite)
         low, high = np.minimum(low, one.low), np.maximum(high, one.high)
-        for key, count in zip(channels, one.filled, strict=True):
+        for key, count in one.filled.items():
             filled[key] += count
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(

@@ -1,0 +1,73 @@
+"""What one look at a block of rows finds: which rows hold a sample, which cells are no numbers, how full the channels are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.kernels.stamps import look
+
+__all__ = ["Seen", "look_at_cells", "with_seen"]
+
+_NONE = np.empty((0, 2), dtype=np.int64)
+
+
+class Seen(NamedTuple):
+    """What a look at some rows found.
+
+    Attributes
+    ----------
+    rows, absent : int
+        Rows, and those without any number.
+    bits : ndarray of uint8
+        One bit a row: some axis has a number.
+    unreadable, infinite : ndarray of int64, shape (n, 2)
+        Half-open spans of present rows in which an axis is NaN, or infinite.
+    low, high : ndarray of float64, shape (n_axes,)
+        Range of the finite values.
+    filled : dict
+        Channel -> rows that have a number.
+    """
+
+    rows: int
+    absent: int
+    bits: NDArray[np.uint8]
+    unreadable: NDArray[np.int64]
+    infinite: NDArray[np.int64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    filled: dict[str, int]
+
+
+def look_at_cells(cells: NDArray[np.float64], channels: Mapping[str, NDArray[Any]], begin: int) -> Seen:
+    """Look at every cell of a block once.
+
+    Parameters
+    ----------
+    cells : ndarray, shape (n_axes, n)
+        Values by axis and row.
+    channels : mapping of str to ndarray, shape (n,)
+        Channels by name.
+    begin : int
+        Row of the log with which the block begins.
+    """
+    present = np.empty(cells.shape[1], dtype=bool)
+    absent, holes, infinities, low, high = look(np.ascontiguousarray(cells, dtype=np.float64), present)
+    unreadable = _spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NONE
+    infinite = _spans(np.isinf(cells).any(axis=0), begin) if infinities else _NONE
+    filled = {name: int(np.isfinite(values).sum()) for name, values in channels.items()}
+    return Seen(present.size, absent, np.packbits(present), unreadable, infinite, low, high, filled)
+
+
+def _spans(bad: Any, offset: int) -> NDArray[np.int64]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
+    return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
+
+
+def with_seen(signal: Any, seen: list[Seen]) -> Any:
+    """Let a dask array (axis, row) carry what was found in its blocks, so that nobody has to look again; what is derived does not."""
+    signal.gyrostab_seen = seen
+    return signal
