@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import signal
@@ -49,14 +50,15 @@ def address(tmp_path_factory):
 
 
 @contextmanager
-def _program(module: str, *arguments: str, env: dict[str, str]) -> Iterator[None]:
+def _program(module: str, *arguments: str, env: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
     """A program that runs beside the tests, and ends with all that it has started."""
     command = [sys.executable, "-m", module, *arguments]
     started = subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        yield
+        yield started
     finally:
-        os.killpg(started.pid, signal.SIGKILL)
+        if started.poll() is None:
+            os.killpg(started.pid, signal.SIGKILL)
         started.wait()
 
 
@@ -237,6 +239,46 @@ def test_distributed_is_not_installed(log, tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
     assert done.returncode == 2
     assert "pip install 'gyrostab[distributed]'" in done.stderr
+
+
+def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(log, whole, tmp_path, monkeypatch, capfd):
+    """The scheduler is killed while parts are on their way; what is finished is kept, and threads do the rest."""
+    where = tmp_path / "scheduler.json"
+    options = ["--window", WINDOW["window"], "--step", WINDOW["step"], "--taus", WINDOW["taus"], "--quiet-progress"]
+    common = ["--scheduler-file", str(where), "--no-dashboard"]
+    worker = ["worker", "--host", "127.0.0.1", "--nworkers", "1", "--nthreads", "1", "--local-directory", str(tmp_path / "worker")]
+    output = tmp_path / "out" / "product.nc"
+    output.parent.mkdir()
+    with ExitStack() as stack:
+        scheduler = stack.enter_context(_program("dask", "scheduler", "--host", "127.0.0.1", "--port", "0", *common, env=dict(os.environ)))
+        stack.enter_context(_program("dask", *worker, *common, env={**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}))
+        _wait_for(where)
+        found = json.loads(where.read_text())["address"]
+
+        def write(*arguments, **given):
+            if scheduler.poll() is None:
+                os.killpg(scheduler.pid, signal.SIGKILL)
+                scheduler.wait()
+            return checkpoint.write_block(*arguments, **given)
+
+        monkeypatch.setattr(engine, "write_block", write)
+        monkeypatch.setattr(engine, "_HELD_SECONDS", 0.0)
+        begun = time.monotonic()
+        assert main(["run", str(log), "-o", str(output), "--scheduler", found, *options]) == 2
+        assert time.monotonic() - begun < 60
+    shown = capfd.readouterr().err
+    assert "the dask scheduler" in shown
+    assert "--resume continues" in shown
+    assert "please report" not in shown
+    assert "Traceback" not in shown
+    monkeypatch.setattr(engine, "write_block", checkpoint.write_block)
+    assert main(["run", str(log), "-o", str(output), "--resume", *options]) == 0
+    (tmp_path / "whole.nc").write_bytes(whole)
+    expected, made = open_arrays(tmp_path / "whole.nc"), open_arrays(output)
+    assert made.keys() == expected.keys()
+    for name, values in made.items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+    assert [path.name for path in output.parent.iterdir()] == [output.name]
 
 
 @pytest.mark.parametrize("name", ["thread", "cluster", ""])

@@ -166,7 +166,7 @@ def _cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
         raise WorkerError(
             f"--scheduler {address}: no dask scheduler answers there ({error}); start one with 'dask scheduler', or correct the address"
         ) from error
-    with client:
+    with contextlib.closing(client):
         try:
             client.wait_for_workers(1, timeout=_TIMEOUT)
         except TimeoutError as error:
@@ -176,10 +176,28 @@ def _cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
         _check_workers(client, address, files)
         executor = client.get_executor(pure=False)
         try:
-            threads = lambda: sum(client.nthreads().values())  # noqa: E731
-            yield Pool(executor.submit, threads, True, partial(client.submit, _same, pure=False))
+            reach = partial(_reach_scheduler, address)
+            yield Pool(
+                partial(reach, executor.submit),
+                lambda: sum(reach(client.nthreads).values()),
+                True,
+                partial(reach, client.submit, _same, pure=False),
+            )
         finally:
             executor.shutdown(wait=False)
+
+
+def _reach_scheduler(address: str, request: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Make a request of a scheduler, or raise `WorkerError` when it does not answer: distributed raises errors of many kinds."""
+    try:
+        return request(*arguments, **options)
+    except Exception as error:
+        raise WorkerError(_describe_loss(address, error)) from error
+
+
+def _describe_loss(address: str, error: BaseException) -> str:
+    said = " ".join(str(error).split()) or type(error).__name__
+    return f"the dask scheduler {address} has died or is out of reach ({said}); start it again".replace("  ", " ")
 
 
 def _same(value: Any) -> Any:
@@ -189,7 +207,7 @@ def _same(value: Any) -> Any:
 def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
     """Let every worker look for the files; a worker elsewhere has another disk, and another gyrostab perhaps."""
     sizes = {os.path.abspath(path): _size(path) for path in files}
-    found = client.run(_look, list(sizes), on_error="return")
+    found = _reach_scheduler(address, client.run, _look, list(sizes), on_error="return")
     from gyrostab import __version__
 
     for worker, answer in found.items():
@@ -277,8 +295,10 @@ def _result(future: Future[Any]) -> Any:
     except BrokenProcessPool as error:
         raise WorkerError("a worker process has died: is the memory enough? Give fewer --workers") from error
     except CancelledError as error:
-        raise WorkerError("the connection to the dask scheduler was lost") from error
+        raise WorkerError(_describe_loss("", error)) from error
     except Exception as error:
         if type(error).__name__ == "KilledWorker":
             raise WorkerError(f"the workers died again and again on the same part ({error}); is their memory enough?") from error
+        if type(error).__module__.startswith("distributed."):  # not of the call, but of the way to it
+            raise WorkerError(_describe_loss("", error)) from error
         raise
