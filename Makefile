@@ -6,8 +6,11 @@ OUT    ?= demo-output
 CASES  ?= 400
 NULLS  ?= 400
 PROOF  ?= proof
+N      ?= 100000
+SEED   ?= 1
+JOBS   ?= $(shell nproc 2>/dev/null || echo 2)
 
-.PHONY: demo test lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
+.PHONY: demo test test-full fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
@@ -30,6 +33,12 @@ demo: $(VENV)/.installed  ## install and run the main job on the shipped log
 
 test: $(VENV)/.installed-test  ## install and run the tests
 	$(BIN)/python -m pytest -n auto --dist loadgroup
+
+test-full: $(VENV)/.installed-test  ## the tests and those that take a minute or more
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m "slow or not slow"
+
+fuzz: $(VENV)/.installed-test  ## try damaged inputs and write docs/fuzzing.md: N=100000 SEED=1 JOBS=2; stop and repeat as you like
+	$(BIN)/python -W ignore -m tests.fuzz --count $(N) --seed $(SEED) --jobs $(JOBS) --output docs/fuzzing.md
 
 lint: $(VENV)/.installed-lint  ## style, types and imports
 	$(BIN)/ruff check .

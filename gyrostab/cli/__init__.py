@@ -6,6 +6,7 @@ Exit codes: 0 done; 2 bad input or usage, with one message on stderr; 3 interrup
 from __future__ import annotations
 
 import importlib
+import logging
 import pkgutil
 import sys
 from collections.abc import Sequence
@@ -41,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
+    logging.getLogger("asyncio").disabled = not debug  # tasks of zarr that nobody asked after would print tracebacks
     try:
         app.config = read_config(tokens, [command for command in app if not command.startswith("-")])
         with plain_notes(), stoppable(), seldom_collected():

@@ -22,6 +22,7 @@ from gyrostab.read.arrays import Fetch, float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.headers import AXIS, KNOWN, TIME, is_time_unit
+from gyrostab.read.mat5 import check_structure
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.packing import ATTRIBUTES, fold_packing, text_attributes
 from gyrostab.store.rows import LibraryRows, Rows, hdf5_rows
@@ -136,6 +137,7 @@ def _arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[
         return
     from scipy.io import loadmat
 
+    check_structure(path)
     try:
         content = loadmat(path, simplify_cells=False, struct_as_record=True, chars_as_strings=True)
     except Exception as error:  # scipy raises bare errors of many kinds on damaged files

@@ -7,6 +7,7 @@ short dimension, or ``name/0`` without one; ``gyro/x`` and ``rate/x`` are gyro a
 from __future__ import annotations
 
 import json
+import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.cf import from_disk
 from gyrostab.errors import FormatError, SchemaError
@@ -115,7 +117,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
             units = log[name].attrs.get("units")
             if units in ON_DISK.values():
                 log[name].attrs["units"] = next(inner for inner, disk in ON_DISK.items() if disk == units)
-        log = log.assign_coords(axis=np.array([str(axis) for axis in log["axis"].values], dtype=str))
+        log = log.assign_coords(axis=_read_labels(path, log["axis"]))
         check_log(log)
         check_stored(path, log.sizes["time"], log.sizes["axis"], options.limits)
     except SchemaError as error:
@@ -133,6 +135,16 @@ def _chunked(stored: xr.Dataset) -> xr.Dataset:
     for variable in stored.variables.values():
         chunks |= variable.encoding.get("preferred_chunks", {})
     return stored.chunk(chunks)
+
+
+def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
+    """The names of the axes as text; numpy holds code points that are none, and Python fails on them."""
+    values = np.atleast_1d(labels.values)
+    if values.dtype.kind == "U" and values.size:
+        codes = np.ascontiguousarray(values).view(np.dtype(np.uint32).newbyteorder(values.dtype.byteorder))
+        if codes.size and codes.max() > sys.maxunicode:
+            raise FormatError(f"{path.name}: the names of its axes are damaged; copy it again")
+    return np.array([str(label) for label in values], dtype=str)
 
 
 def _content(path: Path) -> str:

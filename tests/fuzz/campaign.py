@@ -1,0 +1,134 @@
+"""A campaign: batches of damaged inputs, each of which follows from the seed, the format and its number alone."""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import json
+import random
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from tests.fuzz.mutate import damage
+from tests.fuzz.seeds import Seed, make_seeds
+from tests.fuzz.server import Outcome, Server
+from tests.fuzz.structured import STRUCTURED, draw_inputs
+
+BATCH = 250
+
+
+@dataclass(frozen=True)
+class Input:
+    """What is given to a command."""
+
+    format: str
+    files: dict[str, bytes]
+    main: str
+    options: tuple[str, ...]
+    command: str
+
+
+@dataclass
+class Tally:
+    """What became of the inputs of one format."""
+
+    codes: Counter[str] = field(default_factory=Counter)
+    seconds: float = 0.0  # of the processor
+    slowest: float = 0.0
+    bytes: int = 0
+    failures: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, other: Tally) -> None:
+        """Count the inputs of another batch too."""
+        self.codes.update(other.codes)
+        self.seconds += other.seconds
+        self.slowest, self.bytes = max(self.slowest, other.slowest), max(self.bytes, other.bytes)
+        self.failures += other.failures
+
+    def as_json(self) -> dict[str, Any]:
+        """The tally as JSON holds it; `Tally.from_json` reads it back."""
+        return {**vars(self), "codes": dict(self.codes)}
+
+    @classmethod
+    def from_json(cls, stored: dict[str, Any]) -> Tally:
+        """A tally that `as_json` gave."""
+        return cls(**{**stored, "codes": Counter(stored["codes"])})
+
+
+@cache
+def seeds() -> dict[str, list[Seed]]:
+    """Valid inputs by format, made once in each process."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return make_seeds()
+
+
+@cache
+def server() -> Server:
+    """The child of this process."""
+    made = Server()
+    atexit.register(made.close)
+    return made
+
+
+#: Rows of the result table.
+FORMATS = (
+    "text", "parquet", "netcdf3", "netcdf4", "zarr2", "zarr3", "hdf5", "matlab5", "matlab7.3", "miniseed", "ulog", "las", "tdms", "binary",
+    "layout", "model", "options", "checkpoint", *STRUCTURED,
+)  # fmt: skip
+
+
+def make_input(form: str, seed: int, number: int) -> Input:
+    """One damaged input; the same for the same arguments."""
+    draw = random.Random(f"{seed} {form} {number}")
+    chosen = draw.choice(seeds()[form])
+    others = [other for group in seeds().values() for other in group]
+    files = damage(chosen, seeds()[form] if draw.random() < 0.7 else others, draw)
+    return Input(form, files, chosen.main, chosen.options, draw.choice(chosen.commands))
+
+
+def run_batch(form: str, seed: int, first: int, count: int, folder: str | None) -> tuple[str, int, Tally]:
+    """Try some inputs of one format; those that fail are kept in `folder`."""
+    tally = Tally()
+    if form in STRUCTURED:
+        inputs = (Input(form, *parts) for parts in draw_inputs(form, f"{seed} {form} {first}", count))
+    else:
+        inputs = (make_input(form, seed, number) for number in range(first, first + count))
+    for item in inputs:
+        outcome = server().try_input(item.files, item.command, item.main, item.options)
+        tally.codes[str(outcome.code)] += 1
+        tally.seconds += outcome.worked
+        tally.slowest, tally.bytes = max(tally.slowest, outcome.seconds), max(tally.bytes, outcome.bytes)
+        if not outcome.is_right(may_be_interrupted=form == "checkpoint"):
+            tally.failures.append(report(item, outcome, folder))
+    return form, first, tally
+
+
+def report(item: Input, outcome: Outcome, folder: str | None) -> dict[str, Any]:
+    """A failure in a few words; its input goes to `folder`."""
+    name = hashlib.sha256(repr(sorted(item.files.items())).encode() + item.command.encode()).hexdigest()[:12]
+    if folder is not None:
+        keep_input(item, Path(folder) / f"{item.format}-{name}")
+    return {"format": item.format, "name": name, "command": item.command, "code": outcome.code, "text": outcome.text[-300:]}
+
+
+def keep_input(item: Input, place: Path) -> None:
+    """Write an input so that `load_input` finds it again."""
+    for name, data in item.files.items():
+        (place / "files" / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / "files" / name).write_bytes(data)
+    call = {"format": item.format, "main": item.main, "options": item.options, "command": item.command}
+    place.mkdir(parents=True, exist_ok=True)
+    (place / "call.json").write_text(json.dumps(call, indent=1) + "\n")
+
+
+def load_input(place: Path) -> Input:
+    """An input that `keep_input` wrote."""
+    call = json.loads((place / "call.json").read_text())
+    files = {str(path.relative_to(place / "files")): path.read_bytes() for path in sorted((place / "files").rglob("*")) if path.is_file()}
+    return Input(call["format"], files, call["main"], tuple(call["options"]), call["command"])

@@ -1,0 +1,131 @@
+"""A process that serves many calls of the command line, one after the other: nothing is imported or compiled twice.
+
+Each line of its standard input is the arguments of a call as JSON; each line of its answer says what became of it.
+It shares the limits of memory and time with nobody: its parent stops and replaces it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import io
+import json
+import os
+import resource
+import sys
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+#: Address space [bytes] that a call may take beyond what the loaded program takes.
+SPACE_BYTES = 3 * 2**29
+
+
+def innermost_is_ours(error: BaseException, package: str) -> bool:
+    """Whether an exception was raised by a statement of gyrostab and not by a library that it called."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and frames[-1].filename.startswith(package)
+
+
+def own_fault(error: BaseException | None, package: str) -> str:
+    """Where our own code raised an exception that was then taken for a damaged file; empty when it did not."""
+    from gyrostab.errors import DamageError
+
+    while error is not None:
+        cause = error.__cause__
+        if (
+            isinstance(error, DamageError)
+            and cause is not None
+            and not isinstance(cause, MemoryError)
+            and innermost_is_ours(cause, package)
+        ):
+            last = traceback.extract_tb(cause.__traceback__)[-1]
+            return f"{type(cause).__name__} at {Path(last.filename).name}:{last.name}: {cause}"
+        error = cause
+    return ""
+
+
+def unexpected(error: BaseException | None) -> str:
+    """The last frames of what ended with exit code 1."""
+    if error is None:
+        return ""
+    frames = [f"{Path(frame.filename).name}:{frame.name}:{frame.lineno}" for frame in traceback.extract_tb(error.__traceback__)[-3:]]
+    return f"{type(error).__name__}: {str(error)[:200]} ({' > '.join(frames)})"
+
+
+def peak_bytes(*, reset: bool = False) -> int:
+    """Largest resident memory since the last reset."""
+    if reset:
+        with contextlib.suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")
+        return 0
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def space_bytes() -> int:
+    """Address space in use."""
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
+def call(arguments: list[str], seen: dict[str, Any]) -> dict[str, Any]:
+    """Run the command line once."""
+    from gyrostab import cli
+
+    seen["error"] = None
+    out, err = io.StringIO(), io.StringIO()
+    peak_bytes(reset=True)
+    before = peak_bytes()
+    begun, worked = time.perf_counter(), time.process_time()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code: int | str = cli.main(arguments)
+        except BaseException as error:
+            code, seen["error"] = "traceback", error
+    seconds = time.perf_counter() - begun
+    text = err.getvalue()
+    error = seen["error"]
+    package = str(Path(cli.__file__).parent.parent)
+    return {
+        "code": "traceback" if "Traceback (most recent" in text else code,
+        "seconds": seconds,
+        "worked": time.process_time() - worked,
+        "bytes": max(0, peak_bytes() - before),
+        "fault": own_fault(error, package) or (unexpected(error) if code in (1, "traceback") else ""),
+        "said": text[-400:],
+    }
+
+
+def serve() -> None:
+    """Answer until the input ends."""
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    faulthandler.enable(open(sys.argv[1], "w"))  # noqa: SIM115
+    os.fsync = lambda handle: None  # the disk is not what is tested here
+    from gyrostab import cli
+
+    seen: dict[str, Any] = {"error": None}
+    explain = cli.explain
+
+    def spy(error: Exception) -> int:
+        seen["error"] = error
+        return explain(error)
+
+    cli.explain = spy
+    warm = json.loads(sys.stdin.readline())
+    for arguments in warm:
+        call(arguments, seen)
+    limit = space_bytes() + SPACE_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    print(json.dumps({"ready": True}), file=answers)
+    for line in sys.stdin:
+        print(json.dumps(call(json.loads(line), seen)), file=answers)
+
+
+if __name__ == "__main__":
+    serve()

@@ -1,0 +1,63 @@
+"""Damaged files that once got past the readers."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.io import loadmat, savemat
+
+from gyrostab.errors import FormatError
+from gyrostab.read.mat5 import check_structure
+
+
+@pytest.fixture(scope="module")
+def matlab(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Everything that scipy writes: numbers, text, structures, cells, sparse and complex arrays."""
+    import scipy.sparse
+
+    folder = tmp_path_factory.mktemp("matlab")
+    content = {
+        "numbers": np.arange(12.0).reshape(3, 4), "counts": np.arange(5, dtype=np.int16), "one": 1.0, "empty": np.empty((0, 3)),
+        "complex": np.array([1 + 2j, 3.0]), "text": "hello", "texts": np.array(["ab", "cde"], dtype=object),
+        "flag": np.array([True, False]),
+        "log": {"t": np.arange(4.0), "inner": {"x": np.float32(2.0), "name": "tool"}}, "sparse": scipy.sparse.csc_array(np.eye(3)),
+        "cells": np.array([1.0, "a", np.arange(3)], dtype=object), "long_name_of_a_variable": np.zeros((2, 2, 2)),
+    }  # fmt: skip
+    for packed in (False, True):
+        savemat(folder / f"packed{packed}.mat", content, do_compression=packed, long_field_names=True)
+    savemat(folder / "four.mat", {"x": np.arange(3.0)}, format="4")
+    return sorted(folder.iterdir())
+
+
+def test_the_structure_of_whole_matlab_files_is_accepted(matlab: list[Path]) -> None:
+    for path in matlab:
+        check_structure(path)
+
+
+@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+@given(data=st.data())
+def test_a_matlab_file_that_passes_the_check_is_read_or_refused(matlab: list[Path], data: st.DataObject) -> None:
+    whole = matlab[1].read_bytes()
+    place = data.draw(st.integers(128, len(whole) - 4))
+    number = data.draw(st.one_of(st.sampled_from([0, 1, 2**31 - 1, 2**31, 2**32 - 1]), st.integers(0, 2**32 - 1)))
+    path = matlab[0].with_name("damaged.mat")
+    path.write_bytes(whole[:place] + struct.pack("<I", number) + whole[place + 4 :])
+    try:
+        check_structure(path)
+    except FormatError:
+        return
+    with contextlib.suppress(ValueError, TypeError, KeyError, IndexError, OSError):
+        loadmat(path)  # a crash of scipy would end the tests
+
+
+@pytest.mark.parametrize("size", [129, 200, 1000])
+def test_a_matlab_file_that_is_cut_off_is_refused(matlab: list[Path], tmp_path: Path, size: int) -> None:
+    (tmp_path / "cut.mat").write_bytes(matlab[1].read_bytes()[:size])
+    with pytest.raises(FormatError, match=r"cut\.mat: this MATLAB file is damaged or cut off"):
+        check_structure(tmp_path / "cut.mat")
