@@ -66,10 +66,10 @@ LIMITS: Mapping[str, Limit] = {
         "bytes into one, so a file below that ratio holds almost no written values.",
     ),
     "chunk_bytes": Limit(
-        2**29,
+        2**28,
         "bytes",
-        "A chunk is decoded as a whole in memory, by two threads side by side: 512 MiB keep a run near 1.5 GiB. "
-        "It holds 46 hours of one axis at 400 Hz in doubles; usual chunks hold 1 to 100 MB.",
+        "A chunk is decoded as a whole in memory, and those of all columns that are read side by side are held: 256 MiB keep a run "
+        "near 1.5 GiB. Such a chunk holds 23 hours of one axis at 400 Hz in doubles; usual chunks hold 1 to 128 MiB.",
     ),
 }
 

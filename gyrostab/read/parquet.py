@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
+from gyrostab.limits import check_stored
 from gyrostab.read.arrays import batch_rows, convert_batch, float32_note, holds_dates, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
@@ -42,6 +43,7 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     """The raw log of a Parquet file; see `gyrostab.read.read_log`."""
     file, plan = _look(path, options)
     names = file.schema_arrow.names
+    check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
     intake = Intake(plan.check(), options, limit=limit)
     wanted = [names[column.source] for column in plan.columns]
     for batch in file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted):

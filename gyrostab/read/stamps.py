@@ -178,6 +178,12 @@ def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
     return dates_to_ns(stamps.dt.tz_convert(None).to_numpy())
 
 
+def _all_fit(values: NDArray[np.int64], units: int, up: int, rest: int) -> bool:
+    """Whether no stamp, nor a step on the way to it, leaves 64 bits: as a rule, and found out by the range of the values alone."""
+    ends = (int(values.min()) + units, int(values.max()) + units)
+    return all(abs(end) < _LIMIT and abs(end * up) < _LIMIT and abs(end * up + rest) < _LIMIT for end in ends)
+
+
 def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
     """Stamps of whole numbers of `unit` since `epoch`; a stamp outside the years 1678 to 2262 is `NAT`."""
     zero = epoch if unit.epoch is None else unit.epoch
@@ -187,6 +193,8 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
     limit = (_LIMIT - down) // up - 1
     if max(abs(units), abs(rest)) > _LIMIT // 2:
         return np.full(np.shape(values), NAT, dtype=np.int64)
+    if down == 1 and np.size(values) and _all_fit(values, units, up, rest):
+        return values if (units, up, rest) == (0, 1, 0) else (values + units) * up + rest
     inside = (values <= min(limit - units, _LIMIT)) & (values >= max(-limit - units, -_LIMIT))
     scaled = np.where(inside, values + np.where(inside, units, 0), 0) * up
     if down > 1:
