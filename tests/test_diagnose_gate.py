@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import gyrostab
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.conclusion import conclude
 from gyrostab.diagnose.conclusion.content import effect_tables, unknown_tables
@@ -21,8 +25,9 @@ from gyrostab.diagnose.conclusion.verdict import decide_verdict, failed_checks
 from gyrostab.diagnose.effects.designs import Candidate
 from gyrostab.diagnose.effects.explained import Part
 from gyrostab.diagnose.modelling.limits import mixture_limit
-from gyrostab.diagnose.modelling.refit import Estimate, Fitted
+from gyrostab.diagnose.modelling.refit import Estimate, Fitted, fit_claims
 from gyrostab.diagnose.naming.claims import Claim, Naming
+from gyrostab.physics.registry import effects
 
 from .diagnosed import content
 from .test_diagnose_recalibrate import SHAKE, naming_of, reduced_of
@@ -122,6 +127,7 @@ def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
         ({"log_likelihood_gain": None}, "unknown"),
         ({"forecast_gain": -0.1}, "partly explained"),
         ({"forecast_gain": 0.0}, "explained"),
+        ({"forecast_gain": None}, "explained"),
         ({"coverage95_after": 0.65}, "partly explained"),
         ({"coverage95_before": 0.99, "coverage95_after": 0.95}, "explained"),
         ({"coverage95_before": 0.93, "coverage95_after": 0.92}, "explained"),
@@ -163,3 +169,40 @@ def test_a_limit_over_several_laws_lies_between_theirs(laws):
     ends = size + 1.6448536269514722 * sd
     limit = mixture_limit(size, sd, share / share.sum())
     assert ends.min() * (1.0 - 1e-9) <= limit <= ends.max() * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("points", "told"),
+    [
+        ([[0, 3.0], [400, 6.0], [800, 3.0], [1200, 6.0], [1800, 6.0]], True),
+        ([[0, 0.02], [400, 0.02], [401, 6.0], [800, 6.0], [801, 0.02], [1800, 0.02]], False),
+        ([[0, 0.02], [1500, 0.02], [1501, 6.0], [1800, 6.0]], False),
+    ],
+    ids=["all the time", "over", "at the end"],
+)
+def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: bool):
+    """An event that is over says nothing of later, and the size of one near the end is not known before."""
+    shaken = {"profile": "vibration", "points": points}
+    reduced = reduced_of({"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, axes=("x",), environment=[shaken])
+    baseline = calibrate(reduced)
+    naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
+    held = conclude.worth(reduced, baseline, naming, fit_claims(naming, baseline))
+    assert math.isfinite(held["forecast_gain"]) == told
+    assert held["log_likelihood_gain"] > 0.0
+    if told:
+        assert held["forecast_gain"] > 0.0
+
+
+def test_a_turn_on_the_bench_is_not_explained_by_what_fails_its_forecast(recordings: Callable[[str], Path]):
+    """A real record of 27 s whose rate turns to 123 deg/s at its end; the limits of what was not found once stopped the diagnosis."""
+    path = recordings("fog-hybrid-warmup/run2_turn.txt")
+    known = {"map": {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z"}, "unit": {"gyro": "deg/s", "time": "s"}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = gyrostab.diagnose(gyrostab.regularise(gyrostab.read_log([path], **known)), nulls=100)
+    assert found.verdict == "partly explained"
+    for effect in found.effects:
+        sizes = {name: one for name, one in effect["parameters"].items() if name.split(".")[0] in effects()[effect["name"]].size_parameters}
+        assert not sizes or any(one["low"] > 0.0 or one["high"] < 0.0 for one in sizes.values()), effect
+    failed = failed_checks(found.content["held_out"])
+    assert all(text in str(found) for text in failed)

@@ -181,6 +181,7 @@ def _proof(content: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     def share(value: Any) -> str:
         return "–" if value is None else f"{100.0 * value:.3g} %"
 
+    forecast = "–" if held["forecast_gain"] is None else f"{_number(held['forecast_gain'])} nats"
     gain = f"{_number(held['log_likelihood_gain'])} ± {_number(held['stderr'], 2)} nats"
     return [
         (
@@ -191,7 +192,7 @@ def _proof(content: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         ),
         ("Misfit of the surface (mean z²)", _number(held["misfit_before"]), _number(held["misfit_after"]), "1 is what noise alone gives."),
         ("Cells inside their 95 % band", share(held["coverage95_before"]), share(held["coverage95_after"]), "95 % is right."),
-        ("Forecast of the last 30 %", "0", f"{_number(held['forecast_gain'])} nats", "Fitted on the first 70 % only."),
+        ("Forecast of the last 30 %", "0", forecast, "Fitted on the first 70 % only. A dash: no effect acts in both."),
     ]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.conclusion.account import explanations
+from gyrostab.diagnose.conclusion.account import acting, explanations
 from gyrostab.diagnose.conclusion.content import (
     baseline_table,
     claim_tables,
@@ -24,7 +25,7 @@ from gyrostab.diagnose.conclusion.content import (
     surfaces_with_blocks,
     unknown_tables,
 )
-from gyrostab.diagnose.conclusion.evidence import held_out
+from gyrostab.diagnose.conclusion.evidence import forecast_from, held_out
 from gyrostab.diagnose.conclusion.gate import with_supported_claims
 from gyrostab.diagnose.conclusion.result import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
 from gyrostab.diagnose.conclusion.surfaces import make_surfaces
@@ -145,7 +146,22 @@ def worth(reduced: xr.Dataset, baseline: xr.Dataset, naming: Naming, first: Sequ
     clean = without_odd(reduced, [*parts, *(part for claim in told.expected for part in claim.parts)])
     start = partial(expected_baseline, told, baseline) if told.expected else baseline
     whole, rest = (partial(trained, one) if one.claims else start for one in (told, judged))
-    return held_out(clean, start, rest, more_gain=odd + hopping + waving, shown=whole if waving else None)
+    later = tuple(claim for claim in judged.claims if _can_be_forecast(claim, reduced))
+    forecast = partial(trained, replace(judged, claims=later)) if later else start
+    found = held_out(clean, start, rest, more_gain=odd + hopping + waving, shown=whole if waving else None, forecast=forecast)
+    return found if later or not told.claims else found | {"forecast_gain": np.nan}
+
+
+def _can_be_forecast(claim: Claim, reduced: xr.Dataset) -> bool:
+    """Return whether an effect acts both in the time that a forecast is fitted to and in the time that it predicts.
+
+    The size of an event in the last part is not known before, and one that is over says nothing of later. Counts of odd samples are in
+    neither means nor powers, which the forecast predicts.
+    """
+    if {part.candidate.view for part in claim.parts} <= {"marks"}:
+        return False
+    acts, known = acting(claim, reduced), forecast_from(reduced)
+    return bool(acts[known].any() and acts[~known].any())
 
 
 def _mismatches(task: Task, compared: Compared, fit: Fit, after: xr.Dataset) -> list[dict[str, Any]]:

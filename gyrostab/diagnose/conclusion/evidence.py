@@ -17,7 +17,7 @@ from gyrostab.diagnose.views.davar import allan_surface
 from gyrostab.diagnose.views.mean import window_means
 from gyrostab.errors import OptionError
 
-__all__ = ["Trained", "held_out", "log_likelihood", "stretches"]
+__all__ = ["Trained", "forecast_from", "held_out", "log_likelihood", "stretches"]
 
 #: A baseline, or what fits one to the blocks where its argument, a mask of blocks, is true.
 Trained = xr.Dataset | Callable[[NDArray[np.bool_]], xr.Dataset]
@@ -29,7 +29,13 @@ _INSIDE = 1.959964  # standard deviations that hold 95 %
 
 
 def held_out(
-    reduced: xr.Dataset, before: Trained, after: Trained, *, more_gain: float = 0.0, shown: Trained | None = None
+    reduced: xr.Dataset,
+    before: Trained,
+    after: Trained,
+    *,
+    more_gain: float = 0.0,
+    shown: Trained | None = None,
+    forecast: Trained | None = None,
 ) -> dict[str, float]:
     """Compare two models of a recording on time that they have not seen.
 
@@ -50,6 +56,8 @@ def held_out(
         course, biases of two levels. Lines are in the powers of their bands already, and would count twice.
     shown : xarray.Dataset or callable, optional
         Baseline with all effects, those of `more_gain` too, where `after` is without them: what the Allan variance is compared with.
+    forecast : xarray.Dataset or callable, optional
+        Baseline with the effects that can be forecast; `after` by default.
 
     Returns
     -------
@@ -93,7 +101,7 @@ def held_out(
         "log_likelihood_gain": float(gain),
         "stderr": float(np.sqrt(variance)),
         **_misfits(squares),
-        "forecast_gain": _forecast(reduced, before, after),
+        "forecast_gain": _forecast(reduced, before, after if forecast is None else forecast),
     }
 
 
@@ -276,7 +284,12 @@ def _misfits(squares: dict[str, list[Array]]) -> dict[str, float]:
     return found
 
 
+def forecast_from(reduced: xr.Dataset) -> NDArray[np.bool_]:
+    """Select the blocks that a forecast of the others begins from."""
+    return np.asarray(np.arange(reduced.sizes["block"]) < round(_KNOWN * reduced.sizes["block"]))
+
+
 def _forecast(reduced: xr.Dataset, before: Trained, after: Trained) -> float:
-    known = np.arange(reduced.sizes["block"]) < round(_KNOWN * reduced.sizes["block"])
+    known = forecast_from(reduced)
     late, early = (log_likelihood(reduced, _trained(model, known), known, ~known) for model in (after, before))
     return late - early
