@@ -293,7 +293,7 @@ def write_netcdf(path: Path, law: Law, packed: Packed, clock: Clock, *, form: st
 
 @pytest.mark.parametrize("form", ["NETCDF4", "NETCDF3_CLASSIC", "NETCDF3_64BIT_DATA"])
 @given(law=laws, packed=packings, clock=clocks, chunk=st.sampled_from([1, 37, 294]), level=st.sampled_from([0, 4]))
-@settings(max_examples=25, deadline=None, phases=PHASES)
+@settings(max_examples=15, deadline=None, phases=PHASES)
 def test_netcdf(form, law, packed, clock, chunk, level):
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.nc"
@@ -306,7 +306,7 @@ def test_netcdf(form, law, packed, clock, chunk, level):
 
 
 @given(law=laws, packed=packings, clock=clocks, chunk=st.sampled_from([1, 37, 294]), level=st.sampled_from([None, 4]))
-@settings(max_examples=25, deadline=None, phases=PHASES)
+@settings(max_examples=15, deadline=None, phases=PHASES)
 def test_hdf5(law, packed, clock, chunk, level):
     stamps, time_attributes = clock.store()
     stored, void = packed.store()
@@ -324,6 +324,31 @@ def test_hdf5(law, packed, clock, chunk, level):
                 read_log(path, map=names)
         else:
             check(path, law, within_ns=tolerance(clock), map=names)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@given(law=laws, packed=packings, clock=clocks, chunk=st.sampled_from([37, 294]), matrix=st.booleans())
+@settings(max_examples=10, deadline=None, phases=PHASES)
+@pytest.mark.filterwarnings("ignore:The data type", "ignore:variable .* has multiple fill", "ignore:Consolidated metadata")
+def test_zarr(version, law, packed, clock, chunk, matrix):
+    stamps, time_attributes = clock.store()
+    stored, void = packed.store()
+    time = xr.Variable("obs", stamps, time_attributes)
+    if matrix:
+        gyro = xr.Variable(("obs", "axis"), stored.T, packed.attributes(law, void))
+        raw = xr.Dataset({"gyro": gyro}, {"axis": ["x", "y"]})
+    else:
+        raw = xr.Dataset({f"gyro_{axis}": ("obs", row, packed.attributes(law, void)) for axis, row in zip("xy", stored, strict=True)})
+    raw["time"] = time
+    encoding = {name: {"chunks": (chunk, *variable.shape[1:])} for name, variable in raw.variables.items() if name != "axis"}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.zarr"
+        raw.to_zarr(path, zarr_format=version, consolidated=False, encoding=encoding)
+        if clock.is_refused:
+            with pytest.raises(GyrostabError, match=r"log\.zarr: .*'time'"):
+                read_log(path)
+        else:
+            check(path, law, within_ns=tolerance(clock))
 
 
 @pytest.mark.parametrize("version", ["5", "7.3"])
@@ -361,7 +386,7 @@ def test_matlab(version, law, matrix, whole):
     chunk=st.sampled_from([50, 300]),
     epoch=st.sampled_from(EPOCHS),
 )
-@settings(max_examples=20, deadline=None, phases=PHASES)
+@settings(max_examples=10, deadline=None, phases=PHASES)
 @pytest.mark.filterwarnings("ignore:The data type", "ignore:Consolidated metadata", "ignore:variable .* has multiple fill")
 def test_regular_logs(law, own, store, packed, chunk, epoch):
     with TemporaryDirectory() as folder:

@@ -10,6 +10,7 @@ import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
 from gyrostab.errors import FormatError, UnitError
 from gyrostab.read import read_log
@@ -144,7 +145,7 @@ def test_counts_beyond_the_digits_of_a_float_are_compared_exactly():
     assert np.ma.getmaskarray(packing.read_counts(large)).tolist() == [True, False]
 
 
-def write_regular(path: Path, stored: np.ndarray, attributes: dict[str, Any], **time: Any) -> Path:
+def write_regular(path: Path, stored: np.ndarray, attributes: dict[str, Any], *, zarr_format: int = 3, **time: Any) -> Path:
     """A regular log of some other program: axis, a stamp for each sample, the sampling rate as an attribute."""
     stamps = (["time"], np.arange(ROWS) * 10, {"units": "milliseconds since 2026-01-01", **time})
     log = xr.Dataset(
@@ -154,7 +155,7 @@ def write_regular(path: Path, stored: np.ndarray, attributes: dict[str, Any], **
     ).assign(time_=stamps)
     log = xr.decode_cf(log, decode_times=False, mask_and_scale=False).rename(time_="time")
     if path.suffix == ".zarr":
-        log.to_zarr(path, consolidated=False)
+        log.to_zarr(path, consolidated=False, zarr_format=zarr_format)
     else:
         log.to_netcdf(path, encoding={"rate": {"_FillValue": None}})  # xarray would add NaN
     return path
@@ -183,3 +184,20 @@ def test_an_unwritten_sample_of_a_regular_log_is_missing(tmp_path):
         file.variables["rate"].set_auto_mask(False)
         file.variables["rate"][0, 3] = netCDF4.default_fillvals["f4"]
     assert np.flatnonzero(np.isnan(read_log(path).rate.values[0])).tolist() == [3]
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("named", [True, False])
+def test_the_fill_value_that_zarr_gives_to_every_array_means_nothing(tmp_path, named, regular):
+    """Zarr writes a fill value of 0 by default; samples of 0 are values, in stores with and without names of dimensions."""
+    path = tmp_path / "log.zarr"
+    if regular:
+        if not named:
+            pytest.skip("a regular log names its dimensions")
+        write_regular(path, COUNTS, {"_FillValue": np.int16(0)}, zarr_format=2)
+    else:
+        group = zarr.open_group(path, mode="w", zarr_format=2)
+        for name, values, unit in (("time", np.arange(ROWS), "s"), ("gyro_x", COUNTS, "deg/h")):
+            attributes = {"units": unit} | ({"_ARRAY_DIMENSIONS": ["obs"]} if named else {})
+            group.create_array(name, data=values).attrs.update(attributes)
+    np.testing.assert_array_equal(read_log(path).rate.values[0], COUNTS)

@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.cf import from_disk
-from gyrostab.errors import FormatError, SchemaError
+from gyrostab.errors import FormatError, SchemaError, reading_of
 from gyrostab.limits import check_stored
 from gyrostab.read.arrays import float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
@@ -95,19 +95,9 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
         return _open_own(path, options)
     if content in _NO_LOGS and not options.channels_only:
         raise FormatError(f"{path.name}: is {_NO_LOGS[content]} that gyrostab wrote, and no log; give the log that it was made of")
-    engine: Any = "zarr" if path.is_dir() else "netcdf4"
-    extra: Any = {"consolidated": False} if path.is_dir() else {}
-    try:
-        stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
-    except Exception as error:  # the backends raise errors of many kinds on damaged files
-        raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
-    has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
-    has_stamps = "time" in stored.variables and names_epoch(str(stored.variables["time"].attrs.get("units", "")))
-    if not (has_signal and has_stamps and "sampling_rate_hz" in stored.attrs and "axis" in stored.variables):
-        stored.close()
+    stored = _open_regular(path)
+    if stored is None:
         return None
-    for variable in stored.variables.values() if engine == "netcdf4" else ():
-        variable.attrs = with_default_fill(variable.attrs, variable.dtype)
     log = _chunked(decode_variables(path.name, name_file(stored, path)))  # an index would hold every stamp in memory
     if path.is_dir():
         log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
@@ -127,6 +117,44 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     log.attrs = {name: value.item() if isinstance(value, np.generic) else value for name, value in log.attrs.items()}
     log.attrs.setdefault("source_files", [path.name])
     return _rebuild_time(path, log)
+
+
+def _open_regular(path: Path) -> xr.Dataset | None:
+    """Open a regular log of another program without decoding it, with the fill values that its format implies."""
+    zarr_format, attributes = _read_group(path) if path.is_dir() else (0, {"sampling_rate_hz": None})
+    if "sampling_rate_hz" not in attributes:
+        return None
+    engine: Any = "zarr" if path.is_dir() else "netcdf4"
+    extra: Any = {"consolidated": False} if path.is_dir() else {}
+    try:
+        stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
+    except Exception as error:  # the backends raise errors of many kinds on damaged files
+        raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
+    if not _is_regular(stored):
+        stored.close()
+        return None
+    for variable in stored.variables.values():
+        if engine == "netcdf4":
+            variable.attrs = with_default_fill(variable.attrs, variable.dtype)
+        elif zarr_format == 2 and not variable.attrs.get("_FillValue", 1):
+            del variable.attrs["_FillValue"]  # 0 is what Zarr gives to arrays by default
+    return stored
+
+
+def _is_regular(stored: xr.Dataset) -> bool:
+    """Return whether a dataset has what a regular log has: a signal, its axes, a stamp for each sample, and the rate."""
+    has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
+    has_stamps = "time" in stored.variables and names_epoch(str(stored.variables["time"].attrs.get("units", "")))
+    return has_signal and has_stamps and "sampling_rate_hz" in stored.attrs and "axis" in stored.variables
+
+
+def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
+    """Return format and attributes of a Zarr group; xarray opens no group of format 2 whose arrays name no dimensions."""
+    import zarr
+
+    with reading_of(path):
+        group = zarr.open_group(path, mode="r")
+        return group.metadata.zarr_format, dict(group.attrs)
 
 
 def _chunked(stored: xr.Dataset) -> xr.Dataset:
