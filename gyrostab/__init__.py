@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gyrostab.confidence import confidence_interval as confidence_interval
+    from gyrostab.convert import from_dataarray as from_dataarray
+    from gyrostab.convert import from_dataframe as from_dataframe
     from gyrostab.correlate import correlate as correlate
     from gyrostab.correlate import correlation_rows as correlation_rows
     from gyrostab.davar import davar as davar
@@ -59,6 +61,8 @@ _HOME = {
     "davar": "davar",
     "diagnose": "diagnose.core",
     "fit_noise": "fit",
+    "from_dataarray": "convert",
+    "from_dataframe": "convert",
     "gap_table": "regularise",
     "make_log": "log",
     "make_noise": "simulate",
@@ -95,6 +99,8 @@ __all__ = [
     "davar",
     "diagnose",
     "fit_noise",
+    "from_dataarray",
+    "from_dataframe",
     "gap_table",
     "make_log",
     "make_noise",

@@ -62,7 +62,7 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
     """Lay a dataset out as the file shall hold it; `verb` goes to its history."""
     kind = _kind(dataset)
     dataset = store_names(dataset)
-    grids = _grids(dataset, kind)
+    grids = _grids(dataset)
     divisor = 1000 if _whole_microseconds(dataset, grids) else 1
     since = {"units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}", **_CALENDAR}
     bounds = [str(variable.attrs["bounds"]) for variable in dataset.variables.values() if "bounds" in variable.attrs]
@@ -106,13 +106,9 @@ def _lazy(variable: xr.Variable) -> xr.Variable:
     return variable if variable._in_memory or variable.chunks is not None else variable.chunk("auto")
 
 
-def _grids(dataset: xr.Dataset, kind: str) -> dict[Any, Any]:
-    """The rules of the time axes that are computed, or of a log that might as well be."""
+def _grids(dataset: xr.Dataset) -> dict[Any, Any]:
+    """The rules of the time axes that are computed."""
     grids = {name: index.transform for name, index in dataset.xindexes.items() if isinstance(index, TimeGridIndex)}
-    if kind == "log" and "time" not in grids:
-        stamps, rate = _nanoseconds(dataset["time"].values), float(dataset.attrs["sampling_rate_hz"])
-        if np.array_equal(stamps, grid_times(int(stamps[0]), rate, np.arange(stamps.size))):
-            grids["time"] = time_coordinate(int(stamps[0]), rate, stamps.size).xindexes["time"].transform  # type: ignore[attr-defined]
     taken = [other for name in grids for other in (f"{name}_start", index_dim(name)) if other in dataset.variables]
     if taken:
         raise SchemaError(f"the name {taken[0]!r} is needed for the time axis; rename that variable")
@@ -220,7 +216,8 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     for name, variable in stored.variables.items():
         if name in grids:
             continue
-        parent = stored.variables[bounds[name]] if name in bounds else variable
+        own = " since " in str(variable.attrs.get("units", ""))  # as xarray may write it
+        parent = stored.variables[bounds[name]] if name in bounds and not own else variable
         opened = decode_stamps(variable.copy(deep=False), parent.attrs)
         if opened.dtype.kind in "OT":
             opened = opened.astype(str)
@@ -242,7 +239,8 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
 
 
 def _memory_order(dims: tuple[Any, ...]) -> list[Any]:
-    return [*(dim for dim in dims if dim not in ("tau", "term", "bnds")), *(dim for dim in ("tau", "term", "bnds") if dim in dims)]
+    last = [dim for dim in ("tau", "term", "bnds") if dim in dims]
+    return sorted((dim for dim in dims if dim not in last), key=lambda dim: bool(dim != "axis")) + last
 
 
 def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) -> xr.Variable:

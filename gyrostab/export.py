@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.cf import from_disk, index_dim, to_disk
-from gyrostab.errors import FormatError, OptionError, SchemaError, reading_of
+from gyrostab.convert import as_log
+from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, reading_of
 from gyrostab.output import find_foreign_item, find_sources, new_output
-from gyrostab.schema import check_log, check_product, check_surface
+from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
 from gyrostab.store import (
     Misfit,
     Progress,
@@ -57,7 +59,8 @@ def to_netcdf(
     Parameters
     ----------
     dataset : xarray.Dataset
-        In memory ``(axis, time, tau)``, units as in `gyrostab.units.INNER`.
+        In memory ``(axis, time, tau)``, units as in `gyrostab.units.INNER`. A log is written with the sampling rate of its ``time``,
+        and with NaN where samples have been dropped.
     path : path-like
         The file to make. It takes this name only once it is complete.
     overwrite : bool
@@ -79,6 +82,8 @@ def to_netcdf(
         When there is no such compression, or when the dataset reads from the file.
     OutputError
         When the file exists, or cannot be written; nothing half-written is left behind.
+    TimeError
+        When the time of a log is not in order, or not uniform.
 
     Examples
     --------
@@ -93,8 +98,9 @@ def to_netcdf(
     ...     open_log(to_netcdf(log, folder + "/log.nc")).time.values[1]
     np.datetime64('1970-01-01T00:00:00.003333333')
     """
-    stored = to_disk(dataset, "to_netcdf")
+    dataset = _with_true_time(dataset)
     sources = find_sources(dataset)
+    stored = to_disk(dataset, "to_netcdf")
     filters = _filters(compression)
 
     def write(packed: xr.Dataset) -> None:
@@ -108,6 +114,17 @@ def to_netcdf(
 
     _write_counts(stored, write)
     return Path(path)
+
+
+def _with_true_time(dataset: Any) -> xr.Dataset:
+    """A log on its uniform time, with a true sampling rate and table of gaps; any other dataset as it is."""
+    if not isinstance(dataset, xr.Dataset):
+        return as_log(dataset)
+    for name, units in SIGNAL_UNITS.items():
+        signal = dataset.variables.get(name)
+        if signal is not None and "time" in signal.dims and set(signal.dims) <= {"axis", "time"} and signal.attrs.get("units") == units:
+            return as_log(dataset)
+    return dataset
 
 
 def _begin_netcdf(rest: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
@@ -185,8 +202,9 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
     ...     xr.open_zarr(to_zarr(cube, folder + "/cube.zarr")).avar.dims
     ('axis', 'tau', 'time')
     """
-    stored = to_disk(dataset, "to_zarr")
+    dataset = _with_true_time(dataset)
     sources = find_sources(dataset)
+    stored = to_disk(dataset, "to_zarr")
 
     def write(packed: xr.Dataset) -> None:
         long = long_variables(packed) if _rate(packed) is not None else {}
@@ -258,6 +276,8 @@ def _chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
 def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
     """Open what `to_netcdf` or `to_zarr` wrote, as it was in memory; data stays on disk (dask) until it is used.
 
+    A dataset that xarray wrote by its own `to_netcdf` or `to_zarr` is opened too.
+
     Parameters
     ----------
     path : path-like
@@ -275,7 +295,7 @@ def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
     Raises
     ------
     FormatError
-        When there is no such file, when it is damaged, or when gyrostab did not write it.
+        When there is no such file, or when it is damaged.
 
     Examples
     --------
@@ -376,7 +396,12 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
     ...         print(log.rate.values)
     [[ 1. nan  2.]]
     """
-    return _open(path, "a regular log", check_log, "make one with 'gyrostab ingest'", strict=strict)
+    log = _open(path, "a regular log", partial(check_log, rate=False), "make one with 'gyrostab ingest'", strict=strict)
+    try:
+        return as_log(log)
+    except (SchemaError, TimeError) as error:
+        log.close()
+        raise type(error)(f"{path}: {error}") from error
 
 
 def _open(path: str | os.PathLike[str], what: str, check: Any, advice: str, *, strict: bool = False) -> xr.Dataset:

@@ -19,6 +19,7 @@ __all__ = [
     "MOST_GAPS",
     "ROWS",
     "SAMPLES",
+    "clip_table",
     "duration",
     "gap_variables",
     "name_lost",
@@ -70,6 +71,24 @@ def thinned(table: NDArray[np.int64], most: int = MOST_GAPS) -> NDArray[np.int64
             part = np.column_stack([part[at, FIRST], part[last, END], sums, part[at, CAUSE]])
         parts.append(part)
     return np.concatenate(parts)
+
+
+def clip_table(table: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64]:
+    """Cut a table of gaps to the lines, or parts of lines, from sample `low` to `high`.
+
+    Examples
+    --------
+    >>> clip_table(np.array([[2, 8, 6, 0, 0], [9, 9, 0, 1, 2]]), 0, 5)
+    array([[2, 5, 3, 0, 0]])
+    """
+    first, end = np.maximum(table[:, FIRST], low), np.minimum(table[:, END], high)
+    event = table[:, FIRST] == table[:, END]
+    kept = np.where(event, (table[:, FIRST] >= low) & (table[:, FIRST] < high), end > first)
+    out = table[kept].copy()
+    cut = (end - first)[kept] < out[:, END] - out[:, FIRST]
+    out[:, FIRST], out[:, END] = np.where(event, table[:, FIRST], first)[kept], np.where(event, table[:, END], end)[kept]
+    out[cut, SAMPLES] = np.minimum(out[:, SAMPLES], out[:, END] - out[:, FIRST])[cut]
+    return out
 
 
 def name_lost(table: NDArray[np.int64], spans: Iterable[Iterable[int]], start: int, rate: float) -> NDArray[np.int64]:

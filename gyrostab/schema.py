@@ -45,6 +45,9 @@ ESTIMATORS = ("none", "strict_runs", "weighted_clusters")
 #: Flag values of ``observable(axis, time, term)``.
 OBSERVABLE = ("not_observable", "upper_limit_only", "observed")
 
+#: What tau may differ from a whole number of samples, as a share: the rounding of stored numbers, far below a sample in any window.
+_TAU_TOLERANCE = 1e-9
+
 #: Name of the gyro signal -> its unit; a log has one of them, and its ``kind`` attribute names it.
 SIGNAL_UNITS = {"rate": INNER["rate"], "angle": INNER["angle"]}
 
@@ -139,11 +142,17 @@ def log_channels(log: xr.Dataset) -> list[str]:
 
 
 def _require(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -> None:
+    if not isinstance(dataset, xr.Dataset):
+        raise SchemaError(f"this is a {type(dataset).__name__}, not a {what}: give the whole xarray.Dataset; {_MAKERS[what]} makes one")
     for name, expected in dims.items():
         if name not in dataset.variables:
             raise SchemaError(f"this is not a {what}: it has no variable {name!r}; it has {sorted(map(str, dataset.variables))}")
         if (has := dataset.variables[name].dims) != expected:
             raise SchemaError(f"{what}: variable {name!r} has dimensions {has}, expected {expected}; transpose or rename them")
+
+
+#: What a message calls a dataset -> the function that makes one.
+_MAKERS = {"raw log": "gyrostab.read_log", "log": "gyrostab.make_log", "DAVAR surface": "gyrostab.davar", "product": "gyrostab.fit_noise"}
 
 
 def check_raw(raw: xr.Dataset) -> None:
@@ -153,8 +162,12 @@ def check_raw(raw: xr.Dataset) -> None:
     _check_units(raw, name)
 
 
-def check_log(log: xr.Dataset) -> None:
-    """Raise `SchemaError` unless `log` is a regular log: uniform ``time``, a signal ``(axis, time)`` with units, a rate."""
+def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
+    """Raise `SchemaError` unless `log` has what a regular log has: ``time``, a signal ``(axis, time)`` with units, a rate.
+
+    Whether ``time`` is uniform, and the rate true, is checked by `gyrostab.uniform.as_uniform`, which every function that takes a log
+    calls. With ``rate=False`` the attribute ``sampling_rate_hz`` may be absent.
+    """
     if "row" in log.dims:
         raise SchemaError("these are raw rows with their stamps as written; call gyrostab.regularise(raw) first")
     name = signal_name(log)
@@ -162,9 +175,9 @@ def check_log(log: xr.Dataset) -> None:
     _check_units(log, name)
     if log.sizes["axis"] == 0 or log.sizes["time"] == 0:
         raise SchemaError("the log is empty: it has no axis or no sample")
-    rate = log.attrs.get("sampling_rate_hz")
-    if rate is None or not np.isfinite(rate) or rate <= 0:
-        raise SchemaError(f"the log needs the attribute 'sampling_rate_hz' in Hz, a number above 0; it has {rate!r}")
+    declared = log.attrs.get("sampling_rate_hz")
+    if rate and (declared is None or not np.isfinite(declared) or declared <= 0):
+        raise SchemaError(f"the log needs the attribute 'sampling_rate_hz' in Hz, a number above 0; it has {declared!r}")
 
 
 def _check_units(dataset: xr.Dataset, name: str) -> None:
@@ -174,10 +187,34 @@ def _check_units(dataset: xr.Dataset, name: str) -> None:
 
 
 def check_surface(surface: xr.Dataset) -> None:
-    """Raise `SchemaError` unless `surface` is what `gyrostab.davar` returns."""
+    """Raise `SchemaError` unless `surface` is what `gyrostab.davar` returns, or a part of it."""
     cube = ("axis", "time", "tau")
     _require(surface, "DAVAR surface", dict.fromkeys(("avar", "count", "coverage", "edf", "estimator"), cube))
     _require(surface, "DAVAR surface", dict.fromkeys(("window_mean", "window_coverage"), cube[:2]))
+    units, expected = surface.variables["avar"].attrs.get("units"), VARIABLES["avar"]["units"]
+    if units != expected:
+        raise SchemaError(f"variable 'avar' has units {units!r}, expected {expected!r}; give the surface as gyrostab.davar made it")
+    _check_tau(surface)
+
+
+def _check_tau(surface: xr.Dataset) -> None:
+    """Averaging times are whole numbers of samples, and the window as long as its samples."""
+    rate = surface.attrs.get("sampling_rate_hz")
+    if rate is None or "tau" not in surface.variables:
+        return
+    factors = np.asarray(surface.variables["tau"].values, dtype=np.float64) * float(rate)
+    whole = np.rint(factors)
+    if np.any(whole < 1) or np.any(np.abs(factors - whole) > _TAU_TOLERANCE * whole) or np.any(np.diff(whole) <= 0):
+        raise SchemaError(
+            f"the averaging times of the surface are not rising whole numbers of samples at {float(rate):g} Hz (sampling_rate_hz): they "
+            "have been averaged, interpolated or sorted, or stem from another log; choose them with taus=... in gyrostab.davar"
+        )
+    samples, seconds = surface.attrs.get("window_samples"), surface.attrs.get("window_s")
+    if samples is not None and seconds is not None and abs(samples / rate - seconds) > _TAU_TOLERANCE * seconds:
+        raise SchemaError(
+            f"the surface has windows of {samples} samples and of {seconds:g} s, which do not agree at {float(rate):g} Hz: its attributes "
+            "have been changed; compute it anew with gyrostab.davar"
+        )
 
 
 def check_product(product: xr.Dataset) -> None:

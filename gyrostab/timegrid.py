@@ -8,7 +8,7 @@ nanosecond as a float. 200 h at 300 Hz end on the right nanosecond, and the axis
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import date
 from fractions import Fraction
 from functools import lru_cache
@@ -252,6 +252,17 @@ class _GridTransform(CoordinateTransform):
             dim=self.dims[0],
         )
 
+    def extended(self, size: int) -> _GridTransform:
+        """The same grid with so many samples."""
+        name, dim = str(self.coord_names[0]), self.dims[0]
+        return _GridTransform(self.start, self.rate, size, first=self.first, stride=self.stride, name=name, dim=dim)
+
+    def has_ends_of(self, other: _GridTransform) -> bool:
+        """Whether the other grid, of the same size, has the same first and last stamp."""
+        ends = {self.dims[0]: np.array([0, max(self.size - 1, 0)])}
+        own, others = (grid.forward(ends)[grid.coord_names[0]] for grid in (self, other))
+        return bool(np.array_equal(own, others))
+
 
 class TimeGridIndex(CoordinateTransformIndex):
     """xarray index over a uniform time axis: slices stay lazy, labels select by arithmetic instead of by search."""
@@ -272,6 +283,20 @@ class TimeGridIndex(CoordinateTransformIndex):
         """Keep the index for slices; other selections get an ordinary coordinate."""
         part = indexers[self.transform.dims[0]]
         return type(self)(self.transform.cut(part)) if isinstance(part, slice) else None
+
+    @classmethod
+    def concat(cls, indexes: Sequence[Any], dim: Any, positions: Any = None) -> Any:
+        """Join axes: one that is computed if each goes on where the one before ends, else one in memory."""
+        if positions is None and all(isinstance(index, cls) for index in indexes):
+            grids = [index.transform for index in indexes]
+            whole, at, fits = grids[0].extended(sum(grid.size for grid in grids)), 0, True
+            for grid in grids:
+                fits = fits and whole.cut(slice(at, at + grid.size)).has_ends_of(grid)
+                at += grid.size
+            if fits:
+                return cls(whole)
+        stamps = [index.to_pandas_index() for index in indexes]
+        return xr.indexes.PandasIndex(stamps[0].append(stamps[1:]), dim)
 
     def sel(self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None) -> IndexSelResult:
         """Positions of stamps, exactly or nearest; of slices of time, both ends included; of a day such as "2026-11-20"."""

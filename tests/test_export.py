@@ -304,8 +304,9 @@ def test_foreign_and_damaged_files(tmp_path, files):
         with pytest.raises(FormatError, match=rf"{name}: is not (NetCDF|Zarr), or is damaged or cut short"):
             open_product(tmp_path / name)
     xr.Dataset({"sst": ("x", [1.0])}).to_netcdf(tmp_path / "sea.nc")
-    with pytest.raises(FormatError, match="not one that gyrostab wrote"):
-        open_dataset(tmp_path / "sea.nc")
+    for opener, what in ((open_product, "a product"), (open_surface, "a DAVAR surface"), (open_log, "a regular log")):
+        with pytest.raises(FormatError, match=f"sea.nc: does not hold {what}"):
+            opener(tmp_path / "sea.nc")
     with pytest.raises(FormatError, match=r"nothing\.nc: there is no such file"):
         open_log(tmp_path / "nothing.nc")
 

@@ -14,6 +14,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.convert import as_log
 from gyrostab.davar.channels import window_channels
 from gyrostab.davar.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
 from gyrostab.errors import OptionError
@@ -69,7 +70,10 @@ def davar(
     ----------
     log : xarray.Dataset
         Regular log with ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], NaN where a sample is
-        missing, numpy or dask, float or integer. A dask log stays lazy and gives the same bits for any chunking.
+        missing, numpy or dask, float or integer. A dask log stays lazy and gives the same bits for any chunking. The
+        sampling rate is that of ``time``: a log that was thinned or averaged has its new rate, and samples that were
+        dropped are missing. A DataArray with ``attrs["units"]``, or a pandas table as for `gyrostab.from_dataframe`, is
+        taken too.
     window, step : str or timedelta
         Length and step of the window: a duration (``"10min"``), or a number of samples (``"2000samples"``). A bare number
         is refused. `step` defaults to a tenth of the window.
@@ -110,6 +114,8 @@ def davar(
         When window, step or taus do not fit the record or each other; the message says which and what would.
     SchemaError
         When `log` is not a regular log.
+    TimeError
+        When its time is not in order, or not uniform.
 
     References
     ----------
@@ -126,6 +132,7 @@ def davar(
     >>> float(surface.avar.sel(tau=0.01).mean())  # white noise: avar = sd^2 / k
     0.99...
     """
+    log = as_log(log)
     plan = make_plan(
         log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis, overlap=overlap, gaps=gaps, min_strict=min_strict,
         min_coverage=min_coverage, method=method, convention=convention,
@@ -160,7 +167,7 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     >>> davar_parts(make_log(np.zeros(10**6), rate=100.0, unit="deg/h"), samples=500_000, window="1min", step="30s")
     [slice(0, 85, None), slice(85, 170, None), slice(170, 255, None), slice(255, 332, None)]
     """
-    plan = make_plan(log, **options)
+    plan = make_plan(as_log(log), **options)
     axes, size = plan.signal.shape
     units = units_of_work(size, plan.unit)
     per_unit = max(1, units[0].stop - units[0].start)
@@ -207,6 +214,7 @@ def davar_part(log: xr.Dataset, *, part: slice, space: Workspace | None = None, 
     >>> part.equals(davar(log, window="1min", step="30s").isel(time=slice(3, 5)))
     True
     """
+    log = as_log(log)
     plan = make_plan(log, **options)
     if plan.attrs["method"] != "blocks":
         raise OptionError(f"method={plan.attrs['method']!r} is for whole logs; parts are computed with method='blocks'")

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.errors import OptionError
 from gyrostab.kernels.surface import Unit
-from gyrostab.schema import check_log, signal_name
+from gyrostab.schema import signal_name
 from gyrostab.windows import averaging_factors, samples, thin
 
 __all__ = ["MOST_CELLS", "WINDOWS_S", "Plan", "choose_window", "last_sample", "make_plan", "units_of_work"]
@@ -39,8 +39,7 @@ def make_plan(
     overlap: str = "full", gaps: str = "bridge", min_strict: float = 0.3, min_coverage: float = 0.1, method: str = "blocks",
     convention: str = "all",
 ) -> Plan:  # fmt: skip
-    """Check the options of `davar` against the log."""
-    check_log(log)
+    """Check the options of `davar` against the log, as `gyrostab.convert.as_log` returns it."""
     _check_choices(method=method, gaps=gaps, overlap=overlap, convention=convention)
     name = signal_name(log)
     signal = log[name] if axis is None else _pick(log[name], axis)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.convert import as_log
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
 from gyrostab.diagnose.calibration.known import known_motion, without_known_lines
 from gyrostab.diagnose.conclusion.account import unexpected
@@ -29,7 +30,6 @@ from gyrostab.diagnose.task import Compared, Task, still_lines
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
-from gyrostab.schema import check_log
 from gyrostab.simulate.model import Model, read_model
 from gyrostab.timegrid import first_stamp
 from gyrostab.windows import duration_seconds
@@ -102,7 +102,7 @@ def diagnose(
     from threadpoolctl import threadpool_limits
 
     _check_options(nulls, false_alarm_level, seed)
-    check_log(log)
+    log = as_log(log)
     with threadpool_limits(1, user_api="blas"):  # the matrices are many and small: threads would only wait for each other
         return _diagnose(log, simulation, quiet, seed, nulls, false_alarm_level, block, restart_gap, progress)
 
@@ -123,6 +123,7 @@ def _diagnose(
     log = _with_aligned_channels(log)
     given = simulation if simulation is None or isinstance(simulation, xr.Dataset | Model) else read_model(simulation)
     if isinstance(given, xr.Dataset):
+        given = as_log(given)
         _check_alike(log, given)
     reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
     alive = _axes_alive(reduced)
@@ -214,7 +215,6 @@ def _axes_alive(reduced: xr.Dataset) -> list[str]:
 
 def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:
     """Raise `OptionError` unless the two logs have the same stamps and axes."""
-    check_log(simulated)
     for what, one, other in (
         ("sampling rate", *(f"{float(each.attrs['sampling_rate_hz']):.10g} Hz" for each in (simulated, log))),
         ("number of samples", *(str(each.sizes["time"]) for each in (simulated, log))),

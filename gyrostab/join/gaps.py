@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.gaps import CAUSE, END, FIRST, SAMPLES, thinned
+from gyrostab.gaps import CAUSE, END, FIRST, clip_table, thinned
 from gyrostab.join.axes import group_axes
 from gyrostab.join.grid import Piece
 from gyrostab.schema import GAP_CAUSES
@@ -44,22 +44,10 @@ def _slips(piece: Piece) -> Table:
     return np.stack([end, start, start - end, own - own_end, cause], axis=1)
 
 
-def _clip(table: Table, low: int, high: int) -> Table:
-    """The lines, or parts of lines, from sample `low` to `high`."""
-    first, end = np.maximum(table[:, FIRST], low), np.minimum(table[:, END], high)
-    event = table[:, FIRST] == table[:, END]
-    kept = np.where(event, (table[:, FIRST] >= low) & (table[:, FIRST] < high), end > first)
-    out = table[kept].copy()
-    cut = (end - first)[kept] < out[:, END] - out[:, FIRST]
-    out[:, FIRST], out[:, END] = np.where(event, table[:, FIRST], first)[kept], np.where(event, table[:, END], end)[kept]
-    out[cut, SAMPLES] = np.minimum(out[:, SAMPLES], out[:, END] - out[:, FIRST])[cut]
-    return out
-
-
 def _both(held: Table, new: Table) -> Table:
     """What is missing in both of two logs, with the cause that the first of them gives; its events stay."""
     lines = [held[held[:, FIRST] == held[:, END]]]
-    lines += [_clip(held[held[:, END] > held[:, FIRST]], int(first), int(end)) for first, end in new[:, [FIRST, END]] if end > first]
+    lines += [clip_table(held[held[:, END] > held[:, FIRST]], int(first), int(end)) for first, end in new[:, [FIRST, END]] if end > first]
     return np.concatenate(lines)
 
 
@@ -103,9 +91,9 @@ def _join_group(pieces: Sequence[Piece], begin: int, stop_at: int | None) -> Tab
         if piece.first < stop:
             for place in np.flatnonzero((np.array(ends) > piece.first) & (np.array(firsts) < stop)):
                 held = tables[place]
-                inside = _both(_clip(held, piece.first, stop), _clip(new, piece.first, stop))
-                tables[place] = np.concatenate([_clip(held, -_FAR, piece.first), inside, _clip(held, stop, _FAR)])
-            tables[-1] = np.concatenate([_clip(new, -_FAR, piece.first), _clip(new, stop, _FAR)])
+                inside = _both(clip_table(held, piece.first, stop), clip_table(new, piece.first, stop))
+                tables[place] = np.concatenate([clip_table(held, -_FAR, piece.first), inside, clip_table(held, stop, _FAR)])
+            tables[-1] = np.concatenate([clip_table(new, -_FAR, piece.first), clip_table(new, stop, _FAR)])
         firsts.append(min(piece.first, end))
         ends.append(piece.end)
         end = max(end, piece.end)

@@ -114,8 +114,9 @@ def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = F
             keys: dict[Any, int] = {}
             spec: list[tuple[int, ...]] = []
             for which in np.flatnonzero((first < begin + length) & (end > begin)):
+                earlier = spec.copy()  # the runs of one part do not overlap
                 for key, at, sample, n in placed[which].stretches(begin, begin + length):
-                    shared = any(sample - begin < s[3] + s[4] and s[3] < sample - begin + n for s in spec)
+                    shared = any(sample - begin < s[3] + s[4] and s[3] < sample - begin + n for s in earlier)
                     spec.append((keys.setdefault(key, len(keys)), placed[which].row, at, sample - begin, n, int(shared)))
             task = (_filled, length, lead, list(keys), np.array(spec, dtype=np.int64).reshape(-1, 6))
             layer[(name, place) if flat else (name, number, place)] = task
@@ -129,23 +130,24 @@ def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = F
 
 def fill_parts(rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]) -> None:
     """Samples of one row from `begin` on, as the tasks of `lay` make them."""
-    found = [one for part in rows[row] for one in _reaching(part, begin, begin + out.size)]
+    found = [(number, *one) for number, part in enumerate(rows[row]) for one in _reaching(part, begin, begin + out.size)]
     ends = sorted((at, at + length) for *_, at, length in found)
     if any(stop > start for (_, stop), (start, _) in pairwise(ends)):
         out[:] = np.nan  # what two have is filled up
     else:
         for (_, stop), (start, _) in pairwise([(0, 0), *ends, (out.size, 0)]):
             out[stop:start] = np.nan
-    taken: list[tuple[int, int]] = []
-    for array, own_row, own, at, length in found:
+    taken: dict[int, list[tuple[int, int]]] = {}  # by part: the runs of one part do not overlap
+    for number, array, own_row, own, at, length in found:
         here = out[at : at + length]
-        if any(at < stop and start < at + length for start, stop in taken):
+        earlier = (run for other, runs in taken.items() if other != number for run in runs)
+        if any(at < stop and start < at + length for start, stop in earlier):
             values = np.empty(length)
             fill_row(array, own_row, own, values)
             np.copyto(here, values, where=np.isnan(here))
         else:
             fill_row(array, own_row, own, here)
-        taken.append((at, at + length))
+        taken.setdefault(number, []).append((at, at + length))
 
 
 def _reaching(part: Part, begin: int, end: int) -> list[tuple[Any, int, int, int, int]]:

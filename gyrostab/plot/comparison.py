@@ -9,12 +9,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.convert import as_log
 from gyrostab.errors import OptionError
 from gyrostab.log import make_log
 from gyrostab.plot.signal import thin
 from gyrostab.plot.style import COLOURS, GREY, label_log_axis, literal_text, new_figure, unit_label
 from gyrostab.plot.surface import CHANGE_CMAP
-from gyrostab.schema import check_log, signal_name
+from gyrostab.schema import signal_name
 from gyrostab.windows import duration_seconds
 
 if TYPE_CHECKING:
@@ -75,9 +76,7 @@ def plot_comparison(
     """
     from gyrostab.davar import davar
 
-    logs = without, with_it
-    for log in logs:
-        check_log(log)
+    logs = without, with_it = as_log(without), as_log(with_it)
     shapes = {(signal_name(log), tuple(log["axis"].values), log.sizes["time"]) for log in logs}
     if len(shapes) > 1 or signal_name(without) != "rate" or without.sizes["axis"] < 2:
         raise OptionError(f"plot_comparison needs two logs of rates with the same two axes or more, and as many samples; not {shapes}")

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.convert import as_log
 from gyrostab.errors import OptionError
 from gyrostab.plot.style import axis_names, axis_style, literal_text, new_figure, shade_spans, stack_panels, time_axis, unit_label
 from gyrostab.schema import log_channels, signal_name
@@ -56,6 +57,7 @@ def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[
     >>> plot_signal(log.assign_coords(time_coordinate(0, 100.0, 100))).axes[0].get_ylabel()
     'x [deg/h]'
     """
+    log = as_log(log)
     name = signal_name(log)
     axes, known = axis_names(log, axis), log_channels(log)
     shown = known if channels is None else list(channels)

@@ -278,5 +278,7 @@ def shade_spans(ax: Axes, starts: Any, ends: Any, *, label: str | None = None, a
 
 def require_coefficients(product: xr.Dataset) -> None:
     """Raise `SchemaError` when the dataset holds a surface only."""
+    if not isinstance(product, xr.Dataset):
+        raise SchemaError(f"this is a {type(product).__name__}, not a product: give what gyrostab.fit_noise returns")
     if "observable" not in product.variables:
         raise SchemaError("this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') first")

@@ -28,7 +28,7 @@ from gyrostab.read.pieces import Spool
 from gyrostab.read.unread import refuse_unread
 from gyrostab.schema import texts
 
-__all__ = ["OnFile", "Reader", "read_log", "readers", "scan_file"]
+__all__ = ["OnFile", "Reader", "check_options", "read_log", "readers", "scan_file"]
 
 GROUP = "gyrostab.readers"
 #: Text files that are read side by side.
@@ -249,7 +249,7 @@ def read_log(
             limits=options.limits,
         )
     else:
-        _check_options([*parts.values(), *channels])
+        check_options([*parts.values(), *channels])
         log = concatenate(list(parts.values()))
         if lost and "time" not in log.variables:
             raise FormatError(f"{lost[0].reason}; the files have no time stamps, so the time of those that follow it is not known: mend it")
@@ -340,7 +340,7 @@ def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Datas
     return log.assign_attrs(notes=[*texts(log, "notes"), note])
 
 
-def _check_options(parts: Sequence[xr.Dataset]) -> None:
+def check_options(parts: Sequence[xr.Dataset]) -> None:
     """Refuse a ``--map`` or ``--unit`` that no file has a use for: it is a slip of the pen."""
     unmatched = set.intersection(*(set(part.attrs.pop("unmatched_options", ())) for part in parts))
     headers = dict.fromkeys(name for part in parts for name in part.attrs.pop("headers", ()))

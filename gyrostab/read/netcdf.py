@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.cf import from_disk
-from gyrostab.errors import FormatError, SchemaError, reading_of
+from gyrostab.errors import FormatError, SchemaError, TimeError, reading_of
 from gyrostab.limits import check_stored
 from gyrostab.read.arrays import float32_note, read_columns, summarise
 from gyrostab.read.buffers import SPILL_BYTES
@@ -30,10 +30,11 @@ from gyrostab.read.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.read.packing import Decoder, decode_variables, fold_packing, text_attributes
 from gyrostab.read.stamps import names_epoch
 from gyrostab.read.variables import StoredVariable, open_variables, with_default_fill
-from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name
+from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store import name_file, open_stored, stored_attribute
 from gyrostab.store.rows import LibraryRows, Rows
 from gyrostab.timegrid import grid_times, time_coordinate
+from gyrostab.uniform import as_uniform
 from gyrostab.units import ON_DISK
 
 __all__ = ["matches", "read", "scan"]
@@ -98,25 +99,32 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     stored = _open_regular(path)
     if stored is None:
         return None
-    log = _chunked(decode_variables(path.name, name_file(stored, path)))  # an index would hold every stamp in memory
-    if path.is_dir():
-        log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
+    log = _as_in_memory(path, _chunked(decode_variables(path.name, name_file(stored, path))))  # an index would hold every stamp
     log.set_close(stored.close)
+    check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
     try:
-        for name in log.variables:
-            units = log[name].attrs.get("units")
-            if units in ON_DISK.values():
-                log[name].attrs["units"] = next(inner for inner, disk in ON_DISK.items() if disk == units)
-        log = log.assign_coords(axis=_read_labels(path, log["axis"]))
-        check_log(log)
-        check_stored(path, log.sizes["time"], log.sizes["axis"], options.limits)
+        return _with_uniform_time(log)
     except SchemaError as error:
         raise SchemaError(f"{path.name}: {error}") from error
+    except TimeError:
+        log.close()
+        return None  # its rows are placed by their stamps, as those of any other file
+
+
+def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
+    """Units, names of the axes and attributes as they are in memory."""
+    if path.is_dir():
+        log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
+    for name in log.variables:
+        units = log[name].attrs.get("units")
+        if units in ON_DISK.values():
+            log[name].attrs["units"] = next(inner for inner, disk in ON_DISK.items() if disk == units)
+    log = log.assign_coords(axis=_read_labels(path, log["axis"]) if log["axis"].ndim else str(log["axis"].values))
     for name in str(log.attrs.pop("json_attributes", "")).split():
         log.attrs[name] = json.loads(log.attrs[name])
     log.attrs = {name: value.item() if isinstance(value, np.generic) else value for name, value in log.attrs.items()}
     log.attrs.setdefault("source_files", [path.name])
-    return _rebuild_time(path, log)
+    return log
 
 
 def _open_regular(path: Path) -> xr.Dataset | None:
@@ -189,7 +197,7 @@ def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
     """A log that gyrostab wrote."""
     log = from_disk(open_stored(path, strict=options.strict), path.name)
     try:
-        check_log(log)
+        log = as_uniform(log)
         check_stored(path, log.sizes["time"], log.sizes["axis"], options.limits)
     except SchemaError as error:
         log.close()
@@ -198,23 +206,27 @@ def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
     return log
 
 
-def _rebuild_time(path: Path, log: xr.Dataset) -> xr.Dataset:
-    """Put the computed time axis in place of the stored stamps, where they agree; otherwise refuse the log."""
+def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
+    """The log on a computed time axis; `TimeError` when its stamps lie on none.
+
+    Stamps that agree with the declared rate in `CHECKED_BLOCKS` stretches are not read in full: a sample that is lost or doubled moves
+    every stamp after it.
+    """
     rate, size = float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
     stored = log["time"].variable
 
     def stamps(start: int, stop: int) -> Any:
         return np.asarray(stored[start:stop].values).astype("datetime64[ns]").view(np.int64)
 
-    begin = int(stamps(0, 1)[0])
-    for first in np.unique(np.linspace(0, max(size - 1024, 0), CHECKED_BLOCKS).astype(int)):
-        found = stamps(int(first), min(int(first) + 1024, size))
-        expected = grid_times(begin, rate, np.arange(first, first + len(found)))
-        if np.any(np.abs(found - expected) > 1000):
-            at = int(first) + int(np.argmax(np.abs(found - expected) > 1000))
-            when = np.datetime64(int(stamps(at, at + 1)[0]), "ns")
-            return log.assign_attrs(notes=[*log.attrs.get("notes", []), f"{path.name}: stamp {at} ({when}) is off the grid of {rate:g} Hz"])
-    return log.drop_vars("time").assign_coords(time_coordinate(begin, rate, size))
+    if size > CHECKED_BLOCKS * 1024 and np.isfinite(rate) and rate > 0:
+        begin = int(stamps(0, 1)[0])
+        for first in np.unique(np.linspace(0, size - 1024, CHECKED_BLOCKS).astype(int)):
+            found = stamps(int(first), int(first) + 1024)
+            if np.any(np.abs(found - grid_times(begin, rate, np.arange(first, first + len(found)))) > 1000):
+                break
+        else:
+            log = log.drop_vars("time").assign_coords(time_coordinate(begin, rate, size))
+    return as_uniform(log)
 
 
 def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:

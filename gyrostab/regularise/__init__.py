@@ -25,10 +25,11 @@ from gyrostab.regularise.place import Placement, check_grid, place_by_count, pla
 from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_near, estimate_rate, odd_stretches
 from gyrostab.regularise.repeats import find_repeats, with_repeats
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
-from gyrostab.schema import SIGNAL_UNITS, check_log, check_raw, signal_name, texts
+from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
 from gyrostab.store import chunk_samples
 from gyrostab.store.direct import stretch
 from gyrostab.timegrid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
+from gyrostab.uniform import as_uniform
 from gyrostab.windows import duration_seconds
 
 __all__ = ["gap_table", "regularise"]
@@ -177,7 +178,7 @@ def regularise(
     ----------
     raw : xarray.Dataset
         From `gyrostab.read_log`: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree], ``time(row)``, channels.
-        A regular log is returned as it is.
+        A regular log is returned as it is, or brought back onto its uniform time by `gyrostab.uniform.as_uniform`.
     rate : float, optional
         Sampling rate [Hz]. Found from the stamps when not given; checked against them when given.
     tolerance : float
@@ -223,8 +224,7 @@ def regularise(
     100.0
     """
     if "row" not in raw.dims and "sampling_rate_hz" in raw.attrs:
-        check_log(raw)
-        return raw
+        return as_uniform(raw)
     check_raw(raw)
     _checked(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
     if "axis_rows" in raw.attrs:

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.convert import as_log
 from gyrostab.noise import LAWS
 from gyrostab.output import new_output
 from gyrostab.plot.style import duration, embedded
 from gyrostab.report.page import page_text
-from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_log, check_product, texts
+from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_product, texts
 from gyrostab.summary import TermSummary, describe_record, summarise_terms
 
 __all__ = ["write_report"]
@@ -50,7 +51,7 @@ def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.D
     """
     check_product(product)
     if log is not None:
-        check_log(log)
+        log = as_log(log)
     terms = summarise_terms(product)
     axes = dict.fromkeys(term.axis for term in terms)
     table = [(axis, _coefficients([term for term in terms if term.axis == axis])) for axis in axes]

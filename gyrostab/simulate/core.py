@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.clock import time_of_day
+from gyrostab.convert import as_log
 from gyrostab.errors import OptionError, SchemaError, UnitError
 from gyrostab.gaps import gap_variables
 from gyrostab.noise import TERMS
@@ -94,6 +95,7 @@ def simulate(
     (1.0, 1.0)
     """
     made = model if isinstance(model, Model) else read_model(model)
+    like = None if like is None else as_log(like)
     frame = _frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
     if chunk is not None and chunk < 1:
         raise OptionError(f"chunk={chunk!r}: give at least 1 sample")
@@ -133,7 +135,6 @@ def _frame(model: Model, *, duration: Any, rate: float | None, start: Any, seed:
         extra = [name for name, value in given.items() if value is not None]
         if extra:
             raise OptionError(f"{extra[0]} is taken from the recording that the log shall be like; leave out {extra[0]} or like")
-        check_log(like)
         axes = tuple(str(axis) for axis in like["axis"].values)
         return _checked(model, _Frame(float(like.attrs["sampling_rate_hz"]), like.sizes["time"], first_stamp(like), chosen, axes, factor))
     hertz = model.log.get("rate") if rate is None else rate

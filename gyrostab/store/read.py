@@ -33,7 +33,7 @@ _KEPT_BYTES = 2**24
 
 
 def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
-    """Open what gyrostab wrote, as it lies on disk: times not decoded, data lazy, chunks of a log checked as they are read.
+    """Open a dataset as it lies on disk: times not decoded, data lazy, chunks of a log of gyrostab checked as they are read.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     Raises
     ------
     FormatError
-        When there is no such file, when it is damaged as a whole, or when gyrostab did not write it.
+        When there is no such file, or when it is damaged as a whole.
     """
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
@@ -66,9 +66,6 @@ def _open(path: Path, *, strict: bool) -> xr.Dataset:
         stored = xr.open_dataset(path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise FormatError(f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again") from error
-    if "gyrostab_version" not in stored.attrs:
-        stored.close()
-        raise FormatError(f"{path}: is {name}, but not one that gyrostab wrote; read it with gyrostab.read_log (gyrostab ingest)")
     stored = name_file(stored, path)
     is_log = stored.attrs.get("gyrostab_content") == "log"
     long = _long_variables(stored, path, strict=strict) if is_log else {}
@@ -90,7 +87,8 @@ def _lazy(stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int) -> xr
     """Load what is small, and make dask arrays, by the chunks on disk, of what is not one yet: making and reading one takes its time."""
     rest = {name: stored.variables[name] for name in stored.data_vars if name not in long}
     ready = {
-        name: item.load() if item.size < small else item.chunk(item.encoding.get("preferred_chunks", {})) for name, item in rest.items()
+        name: item.load() if item.size < small else item.chunk(item.encoding.get("preferred_chunks") or "auto")
+        for name, item in rest.items()
     }
     coords = xr.Coordinates({name: stored.variables[name] for name in stored.coords}, indexes={})
     lazy = xr.Dataset({name: long.get(name, ready.get(name)) for name in stored.data_vars}, coords, stored.attrs)
