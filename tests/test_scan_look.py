@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gyrostab.export import open_product
-from gyrostab.read.guess import EARTH_RATE_DPH, guess_columns
+from gyrostab.read.guess import EARTH_RATE_DPH, guess_columns, rate_plausibility
 from gyrostab.read.look import look_into
 from tests.command_line import call
 
@@ -23,11 +23,11 @@ DEG_PER_RAD = 180 / np.pi
 
 
 def gyro_dps(*, fine: bool = False, seed: int = 3) -> NDArray[np.float64]:
-    """Three axes at rest [deg/s]: a MEMS part (0.3 deg/sqrt(h), bias 0.2 deg/s), or a fine gyro that sees the Earth turn."""
+    """Three axes at rest [deg/s]: a MEMS part (0.3 deg/sqrt(h), bias 0.4 deg/s), or a fine gyro that sees the Earth turn."""
     noise = np.random.default_rng(seed).standard_normal((3, ROWS))
     if fine:
         return noise * 0.003 / 60 * np.sqrt(RATE) + (np.array([0.6, -0.35, 0.72]) * EARTH_RATE_DPH / 3600)[:, None]
-    return noise * 0.3 / 60 * np.sqrt(RATE) + np.array([0.2, -0.1, 0.05])[:, None]
+    return noise * 0.3 / 60 * np.sqrt(RATE) + np.array([0.3, -0.2, 0.1])[:, None]
 
 
 def accelerations(*, gravity: float = 9.81, seed: int = 4) -> NDArray[np.float64]:
@@ -180,3 +180,22 @@ def test_a_binary_and_a_matlab_file_are_looked_into(tmp_path: Path, monkeypatch,
     words = next_command(capsys.readouterr().out)
     assert {"imu.gyr/0=gyro_x", "imu.gyr/2=gyro_z", "gyro=deg/s", "time=s"} <= set(words)
     assert call(*words, "--quiet-progress") == 0
+
+
+@pytest.mark.parametrize("kind", ["mems", "fine"])
+@pytest.mark.parametrize("unit", ["rad/s", "deg/s", "deg/h"])
+def test_the_unit_is_guessed_from_the_noise_and_the_rotation_of_the_earth(kind: str, unit: str) -> None:
+    """Sensors of many sizes at rest, without a word on their unit: right in 89 % or more (of 4000; here 300 are drawn)."""
+    rng = np.random.default_rng(1)
+    factors = {"rad/s": 3600 * DEG_PER_RAD, "deg/s": 3600.0, "deg/h": 1.0}
+    right = 0
+    for _ in range(300):
+        rate = 10 ** rng.uniform(1.7, 3)
+        walk = 10 ** (rng.uniform(-1.3, 0.3) if kind == "mems" else rng.uniform(-3, -1.3))  # deg/sqrt(h)
+        bias = rng.standard_normal(3) * 10 ** (rng.uniform(1.5, 3.7) if kind == "mems" else rng.uniform(-2, 0.7))  # deg/h
+        spin = rng.standard_normal(3)
+        means = (bias + EARTH_RATE_DPH * spin / np.linalg.norm(spin)) / factors[unit]
+        scatter = walk * 60 * np.sqrt(rate) / factors[unit]
+        top = abs(means).max() + 5 * scatter
+        right += unit == max(factors, key=lambda one: rate_plausibility(means, scatter, top, factors[one], rate))
+    assert right >= 0.85 * 300

@@ -22,12 +22,14 @@ from gyrostab.read.headers import AXIS, TIME, is_time_unit, is_unit_of
 from gyrostab.read.look import ColumnLook, FileLook
 from gyrostab.units import parse_unit
 
-__all__ = ["Guess", "guess_columns", "temperature_unit"]
+__all__ = ["Guess", "guess_columns", "rate_plausibility", "temperature_unit"]
 
 #: Rotation of the Earth [deg/h].
 EARTH_RATE_DPH = 15.041
 #: A fine gyro at rest measures it this well: its bias is a few tenths of a deg/h.
 EARTH_TOLERANCE = 0.02
+#: One with a bias of some deg/h measures it this well.
+EARTH_NEIGHBOURHOOD = 0.3
 #: Largest full scale of gyros [deg/h].
 MAX_RATE_DPH = 4000.0 * 3600.0
 #: Angle random walk of the usual sensor, and how far others are from it [deg/sqrt(h), decades].
@@ -308,7 +310,7 @@ def _guess_unit(look: FileLook, axes: dict[str, ColumnLook], rate: float, reason
     means = np.array([c.mean for c in group])
     scatter = float(np.median([c.scatter for c in group]))
     top = max(max(abs(c.low), abs(c.high)) for c in group)
-    scores = {unit: _plausibility(means, scatter, top, parse_unit(unit).factor, rate) for unit in ("rad/s", "deg/s", "deg/h")}
+    scores = {unit: rate_plausibility(means, scatter, top, parse_unit(unit).factor, rate) for unit in ("rad/s", "deg/s", "deg/h")}
     unit = max(scores, key=lambda unit: scores[unit])
     factor = parse_unit(unit).factor
     walk = scatter * factor / (60.0 * math.sqrt(rate)) if rate > 0 else math.nan
@@ -317,7 +319,7 @@ def _guess_unit(look: FileLook, axes: dict[str, ColumnLook], rate: float, reason
     return unit
 
 
-def _plausibility(means: np.ndarray, scatter: float, top: float, factor: float, rate: float) -> float:
+def rate_plausibility(means: np.ndarray, scatter: float, top: float, factor: float, rate: float) -> float:
     """How well a unit of `factor` deg/h fits the numbers of a gyro, as a logarithm."""
     if top * factor > MAX_RATE_DPH:
         return -math.inf
@@ -326,6 +328,8 @@ def _plausibility(means: np.ndarray, scatter: float, top: float, factor: float, 
     norm = float(np.linalg.norm(means)) * factor
     if len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_TOLERANCE:
         score += 4.0  # the rotation of the Earth; by chance 0.04 of 4 ln 10 in the logarithm, which is e^-5
+    elif len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_NEIGHBOURHOOD:
+        score += 2.0  # with a bias of some deg/h; by chance 0.6 of 4 ln 10, which is e^-3
     elif len(means) == 3 and norm < 0.5 * EARTH_RATE_DPH:
         score -= 1.0  # less than the Earth turns: only if the mean was taken off
     return score
