@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 
-from tests.fuzz.campaign import BATCH, FORMATS, Tally, load_input, run_batch, server
+from tests.fuzz.campaign import BATCH, FORMATS, Tally, ignore_interrupts, load_input, run_batch, server
 from tests.fuzz.table import page, table
 
 ROOT = Path(__file__).parents[2]
@@ -57,7 +57,7 @@ def run(count: int, seed: int, jobs: int, formats: Sequence[str], *, work: Path,
     left = [batch for batch in planned if batch not in done]
     begun, complete = time.monotonic(), True
     failures = str(work / "failures")
-    pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))
+    pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=ignore_interrupts)
     try:
         pending = {}
         queue = iter(left)
@@ -79,6 +79,8 @@ def run(count: int, seed: int, jobs: int, formats: Sequence[str], *, work: Path,
                 print(f"\r{tried} of {count} inputs, {failed} failures, {tried / max(seconds, 1e-9):.0f} inputs/s ", end="", flush=True)
     except KeyboardInterrupt:
         complete = False
+        for process in list(pool._processes.values()):
+            process.terminate()  # their children end with them
     finally:
         pool.shutdown(wait=complete, cancel_futures=True)
     print()

@@ -6,6 +6,7 @@ import atexit
 import hashlib
 import json
 import random
+import signal
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cache
@@ -90,6 +91,11 @@ def make_input(form: str, seed: int, number: int) -> Input:
     others = [other for group in seeds().values() for other in group]
     files = damage(chosen, seeds()[form] if draw.random() < 0.7 else others, draw)
     return Input(form, files, chosen.main, chosen.options, draw.choice(chosen.commands))
+
+
+def ignore_interrupts() -> None:
+    """Leave Ctrl-C to the first process, which stops the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def run_batch(form: str, seed: int, first: int, count: int, folder: str | None) -> tuple[str, int, Tally]:

@@ -12,6 +12,7 @@ import io
 import json
 import os
 import resource
+import shutil
 import sys
 import time
 import traceback
@@ -125,6 +126,7 @@ def serve() -> None:
     print(json.dumps({"ready": True}), file=answers)
     for line in sys.stdin:
         print(json.dumps(call(json.loads(line), seen)), file=answers)
+    shutil.rmtree(Path(sys.argv[1]).parent, ignore_errors=True)  # the parent has gone
 
 
 if __name__ == "__main__":
