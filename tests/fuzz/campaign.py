@@ -18,7 +18,7 @@ from tests.fuzz.seeds import Seed, make_seeds
 from tests.fuzz.server import Outcome, Server
 from tests.fuzz.structured import STRUCTURED, draw_inputs
 
-BATCH = 250
+BATCH = 100
 
 
 @dataclass(frozen=True)
