@@ -128,7 +128,7 @@ def look_into(path: str | Path, options: ReadOptions | None = None) -> FileLook:
 def _row_rate(log: xr.Dataset, dim: str) -> float:
     """Rows in a second, NaN without stamps."""
     clock = "time" if dim == "row" else dim
-    if clock not in log.variables:
+    if clock not in log.variables or dim not in log.sizes:
         return math.nan
     paces = []
     for start in range(0, log.sizes[dim], CHUNK_ROWS):

@@ -32,13 +32,14 @@ def innermost_is_ours(error: BaseException, package: str) -> bool:
 def own_fault(error: BaseException | None, package: str) -> str:
     """Where our own code raised an exception that was then taken for a damaged file; empty when it did not."""
     from gyrostab.errors import DamageError
+    from gyrostab.store.layout import ChunkDamage
 
     while error is not None:
         cause = error.__cause__
         if (
             isinstance(error, DamageError)
             and cause is not None
-            and not isinstance(cause, MemoryError)
+            and not isinstance(cause, MemoryError | ChunkDamage)
             and innermost_is_ours(cause, package)
         ):
             last = traceback.extract_tb(cause.__traceback__)[-1]
