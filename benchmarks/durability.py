@@ -1,0 +1,379 @@
+"""Kill, damage, starve and disturb the commands that write, and count what was lost; writes the table of docs/durability.md.
+
+    python benchmarks/durability.py [--kills 50] [--seed 1] [--minutes 8] [--write docs/durability.md]
+
+Every trial is a child of this process, which has loaded and compiled all that it needs. A kill is SIGKILL at a moment drawn evenly over
+the time that an undisturbed command takes. The log is short; `gyrostab run` cuts it into parts of one unit of work, so that it has as
+many as a long log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+QUIET = "--quiet-progress"
+WINDOW = ("--window", "4000samples", "--step", "4000samples", "--taus", "12", "--workers", "1")
+DIAGNOSE = ("--nulls", "100", "--seed", "1", "--workers", "1")
+_AFTER_KILL = {"run": " with `--resume`", "diagnose": " (one time in five)"}
+_FINISHED = 5  # one in so many killed diagnoses is made again: it takes long, and begins from nothing
+START, END = "<!-- durability: begin -->", "<!-- durability: end -->"
+
+
+class Outcome(NamedTuple):
+    """How a child ended: its exit code, negative for a signal, and what it wrote to stderr."""
+
+    code: int
+    message: str
+
+
+class Trials:
+    """Counts of the trials of one kind."""
+
+    def __init__(self, what: str, expected: str):
+        self.what, self.expected, self.count, self.wrong = what, expected, 0, list[str]()
+
+    def add(self, good: bool, what: str = "") -> None:
+        self.count += 1
+        if not good:
+            self.wrong.append(what)
+
+    def row(self) -> str:
+        return f"| {self.what} | {self.count} | {self.expected} | {self.count - len(self.wrong)} |"
+
+
+def write_inputs(folder: Path) -> None:
+    """A log of one axis at 100 Hz for `run`, the same as text for `ingest`, and ten minutes at 10 Hz for `diagnose`."""
+    from gyrostab import make_log, to_netcdf
+
+    rng = np.random.default_rng(3)
+    rate = 5.0 + rng.standard_normal((1, 1_270_000))
+    rate[:, 400_000:405_000] = np.nan
+    to_netcdf(make_log(rate, rate=100.0, unit="deg/h", start="2026-05-01"), folder / "log.nc")
+    to_netcdf(make_log(rng.standard_normal((1, 6000)), rate=10.0, unit="deg/h", start="2026-05-01"), folder / "short.nc")
+    rows = "\n".join(f"{i / 100:.2f},{value:.4f}" for i, value in enumerate(rate[0, 500_000:800_000]))
+    (folder / "log.csv").write_text(f"time [s],gyro_x [deg/h]\n{rows}\n")
+
+
+def begin(*arguments: object, before: Callable[[], object] | None = None) -> tuple[int, Path]:
+    """Begin a command in a child of this process, in a group of its own; its process and the file of its stderr."""
+    import dask.threaded
+
+    from gyrostab.cli import main
+
+    handle, name = tempfile.mkstemp()
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.dup2(handle, 2)
+        code = 1
+        try:
+            dask.threaded.default_pool = None  # its threads are those of the parent
+            dask.threaded.pools.clear()
+            if before is not None:
+                before()
+            code = main([str(argument) for argument in arguments])
+        finally:
+            sys.stderr.flush()
+            os._exit(code)
+    os.close(handle)
+    return child, Path(name)
+
+
+def finish(begun: tuple[int, Path]) -> Outcome:
+    """Wait for a command."""
+    child, said = begun
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    message = said.read_text(errors="replace")
+    said.unlink()
+    return Outcome(code, message)
+
+
+def call(*arguments: object, before: Callable[[], object] | None = None) -> Outcome:
+    return finish(begin(*arguments, before=before))
+
+
+def read_tree(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def is_hidden(folder: Path, name: str) -> bool:
+    """Whether what lies beside an output is a leftover or the folder of a run."""
+    from gyrostab.output import is_leftover
+
+    return is_leftover(name) or name.endswith(".job")
+
+
+class Bench:
+    """The inputs, undisturbed outputs, and how long they took."""
+
+    def __init__(self, folder: Path, seed: int):
+        self.inputs, self.folder, self.draw = folder / "inputs", folder / "trials", random.Random(seed)
+        self.inputs.mkdir()
+        self.folder.mkdir()
+        write_inputs(self.inputs)
+        self.commands = {
+            "run": (["run", self.inputs / "log.nc", *WINDOW, QUIET], "product.nc"),
+            "ingest": (["ingest", self.inputs / "log.csv", QUIET], "log.nc"),
+            "diagnose": (["diagnose", self.inputs / "short.nc", *DIAGNOSE, QUIET], "found"),
+        }
+        from gyrostab.cli import main
+
+        self.whole, self.seconds = {}, {}
+        for name, (command, output) in self.commands.items():
+            with contextlib.redirect_stdout(io.StringIO()):
+                assert main([*map(str, command), "-o", str(folder / f"first-{name}{Path(output).suffix}")]) == 0  # loads and compiles
+            begun = time.perf_counter()
+            outcome = call(*command, "-o", folder / f"{name}-{output}")
+            self.seconds[name] = time.perf_counter() - begun
+            assert outcome.code == 0, outcome.message
+            self.whole[name] = self.content(name, folder / f"{name}-{output}")
+
+    def content(self, name: str, output: Path) -> object:
+        """What is compared of an output: all bytes; of a diagnosis, which holds the time it took, what it says."""
+        if not os.path.lexists(output):
+            return None
+        if name != "diagnose":
+            return output.read_bytes()
+        import json
+
+        found = json.loads((output / "diagnosis.json").read_text())
+        found.pop("seconds")
+        return json.dumps(found), (output / "model.toml").read_text(), sorted(path.name for path in output.iterdir())
+
+    @contextlib.contextmanager
+    def trial(self) -> Iterator[Path]:
+        folder = Path(tempfile.mkdtemp(dir=self.folder))
+        yield folder
+        shutil.rmtree(folder)
+
+    def kill(self, name: str, kills: int, deadline: float) -> Trials:
+        """Kill a command at random moments; then let it finish, and compare."""
+        command, output = self.commands[name]
+        again = ["--resume"] if name == "run" else []
+        trials = Trials(f"`kill -9` of `{name}` at a random moment, then the same command{_AFTER_KILL.get(name, '')}",
+                        "no output or the whole one after the kill, inputs unchanged, the same output in the end")  # fmt: skip
+        inputs = read_tree(self.inputs)
+        while trials.count < kills and time.monotonic() < deadline:
+            with self.trial() as folder:
+                target = folder / output
+                begun = begin(*command, "-o", target)
+                time.sleep(self.draw.uniform(0.0, self.seconds[name]))
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(begun[0], signal.SIGKILL)
+                if finish(begun).code != -signal.SIGKILL:
+                    continue  # it was faster
+                after = self.content(name, target)
+                strange = [item.name for item in folder.iterdir() if item.name != output and not is_hidden(folder, item.name)]
+                flags = again or (["--overwrite"] if after is not None else [])
+                good = after in (None, self.whole[name]) and not strange and read_tree(self.inputs) == inputs
+                outcome = None
+                if name != "diagnose" or trials.count % _FINISHED == 0:
+                    outcome = call(*command, "-o", target, *flags)
+                    good = good and outcome.code == 0 and self.content(name, target) == self.whole[name]
+                trials.add(good, f"{name}: left {strange}, {outcome}")
+        return trials
+
+    def interrupted_run(self, folder: Path, parts: int = 3) -> Path:
+        """A run that is killed once some of its parts are on the disk."""
+        target = folder / "product.nc"
+
+        def arm() -> None:
+            from gyrostab.run import checkpoint, engine
+
+            engine._HELD_SECONDS = 0.0
+            done = []
+
+            def write(*arguments: object, **options: object) -> object:
+                if len(done) == parts:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                done.append(checkpoint.write_block(*arguments, **options))
+                return done[-1]
+
+            engine.write_block = write
+
+        outcome = call(*self.commands["run"][0], "-o", target, before=arm)
+        assert outcome.code == -signal.SIGKILL, outcome
+        return target
+
+    def damage(self, count: int) -> list[Trials]:
+        """Cut or flip the files of a killed run, and continue it."""
+        kinds = []
+        for what in ("cut short", "with one bit flipped"):
+            trials = Trials(f"a file of a killed run {what}, then `--resume`", "the same product, bit for bit")
+            for _ in range(count):
+                with self.trial() as folder:
+                    target = self.interrupted_run(folder)
+                    path = self.draw.choice(sorted(folder.glob(".product.nc.job/*[!k]")))
+                    content = bytearray(path.read_bytes())
+                    place = self.draw.randrange(len(content))
+                    if what == "cut short":
+                        del content[place:]
+                    else:
+                        content[place] ^= 1 << self.draw.randrange(8)
+                    path.write_bytes(content)
+                    outcome = call(*self.commands["run"][0], "-o", target, "--resume")
+                    trials.add(outcome.code == 0 and target.read_bytes() == self.whole["run"], f"{path.name} {what}: {outcome}")
+            kinds.append(trials)
+        return kinds
+
+    def full_disk(self, count: int) -> Trials:
+        """Write to a file system without room: a small tmpfs where root may mount one, else under a limit of the file size."""
+        import resource
+
+        mount = self.folder / "small"
+        mount.mkdir()
+        trials = Trials(
+            "disk full (tmpfs of random size), `run` and `ingest`", "exit code 2, one message, no output, the old output unchanged"
+        )
+        size = {name: len(self.whole[name]) for name in ("run", "ingest")}
+        for number in range(count):
+            name = ("run", "ingest")[number % 2]
+            command, output = self.commands[name]
+            room = int(size[name] * self.draw.uniform(0.1, 0.9)) // 4096 * 4096 + 4096
+            mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", mount], capture_output=True).returncode == 0
+            if not mounted:
+                trials.what = trials.what.replace("tmpfs of random size", "by a limit of the file size")
+            try:
+                old = mount / output
+                if number % 4 > 1:
+                    old.write_text("old")
+                limit = None if mounted else (lambda room=room: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)))
+                outcome = call(*command, "-o", old, "--overwrite", before=limit)
+                kept = old.read_text() == "old" if number % 4 > 1 else not old.exists()
+                left = [item.name for item in mount.iterdir() if item.name != output and not item.name.endswith(".job")]
+                one = sum(not line.startswith("note: ") for line in outcome.message.splitlines()) == 1
+                trials.add(
+                    outcome.code == 2 and kept and not left and one and "cannot be written" in outcome.message, f"{name}: {left}, {outcome}"
+                )
+            finally:
+                if mounted:
+                    subprocess.run(["umount", mount], check=True)
+                else:
+                    shutil.rmtree(mount)
+                    mount.mkdir()
+        return trials
+
+    def read_only(self) -> Trials:
+        """Write into a folder without permission, as another user where this one is root."""
+        trials = Trials("output in a folder without permission to write", "exit code 2, one message, nothing written")
+        for name, (command, output) in self.commands.items():
+            with self.trial() as folder:
+                (folder / "locked").mkdir(mode=0o555)
+                user = (lambda: os.seteuid(65534)) if os.geteuid() == 0 else None
+                self.folder.parent.chmod(0o755), self.folder.chmod(0o755), folder.chmod(0o755)
+                outcome = call(*command, "-o", folder / "locked" / output, before=user)
+                trials.add(outcome.code == 2 and not list((folder / "locked").iterdir()), f"{name}: {outcome}")
+        return trials
+
+    def changed_input(self, count: int) -> list[Trials]:
+        """Change or remove the input of a command while it works."""
+        kinds = []
+        for what in ("changes", "vanishes"):
+            trials = Trials(
+                f"an input that {what} during `run` or `ingest`", "exit code 2 and no output, or the whole output of the old input"
+            )
+            for number in range(count):
+                name = ("run", "ingest")[number % 2]
+                command, output = self.commands[name]
+                with self.trial() as folder:
+                    own = folder / Path(command[1]).name
+                    shutil.copy2(command[1], own)
+                    begun = begin(command[0], own, *command[2:], "-o", folder / output)
+                    time.sleep(self.draw.uniform(0.2, 0.8) * self.seconds[name])
+                    if what == "vanishes":
+                        own.unlink()
+                    else:
+                        with own.open("r+b") as file:
+                            file.seek(own.stat().st_size // 2)
+                            file.write(b"9" * 64)
+                    outcome = finish(begun)
+                    found = self.content(name, folder / output)
+                    good = (outcome.code == 2 and found is None) or (outcome.code == 0 and found == self.whole[name])
+                    trials.add(good and "please report" not in outcome.message, f"{name}, {what}: {outcome}")
+            kinds.append(trials)
+        return kinds
+
+    def two_at_once(self, count: int) -> list[Trials]:
+        """Begin the same command twice for one output."""
+        kinds = []
+        for name in ("run", "ingest"):
+            command, output = self.commands[name]
+            trials = Trials(f"two `{name}` of one output at once", "one is done, the other refused (exit code 2), one whole output")
+            for _ in range(count):
+                with self.trial() as folder:
+                    begun = [begin(*command, "-o", folder / output)]
+                    time.sleep(self.draw.uniform(0.0, 0.5) * self.seconds[name])
+                    begun.append(begin(*command, "-o", folder / output))
+                    outcomes = [finish(one) for one in begun]
+                    left = [item.name for item in folder.iterdir()]
+                    codes = sorted(outcome.code for outcome in outcomes)
+                    good = codes == [0, 2] and left == [output] and self.content(name, folder / output) == self.whole[name]
+                    trials.add(good, f"{name}: {left}, {outcomes}")
+            kinds.append(trials)
+        return kinds
+
+
+def publish(page: Path, trials: list[Trials], said: str) -> None:
+    """Put the table between the two marks of a page."""
+    table = ["| what was done | trials | what must follow | so it was |", "|---|---|---|---|", *(kind.row() for kind in trials)]
+    text = page.read_text()
+    head, tail = text.partition(START)[0], text.partition(END)[2]
+    page.write_text(f"{head}{START}\n{said}\n\n" + "\n".join(table) + f"\n{END}{tail}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=20.0, help="longest time for the kills of each command")
+    parser.add_argument("--write", type=Path)
+    given = parser.parse_args()
+    os.environ["SOURCE_DATE_EPOCH"] = "1700000000"
+    from gyrostab.davar import davar_parts
+
+    davar_parts.__kwdefaults__["samples"] = 1
+    with tempfile.TemporaryDirectory() as name:
+        bench = Bench(Path(name), given.seed)
+        print({command: f"{seconds:.2f} s" for command, seconds in bench.seconds.items()}, flush=True)
+        trials: list[Trials] = []
+        steps: list[Callable[[], Trials | list[Trials]]] = [
+            lambda: bench.damage(10),
+            lambda: bench.full_disk(12),
+            bench.read_only,
+            lambda: bench.changed_input(10),
+            lambda: bench.two_at_once(10),
+        ]
+        kills = [lambda name=name: bench.kill(name, given.kills, time.monotonic() + 60 * given.minutes) for name in bench.commands]
+        for step in (*kills, *steps):
+            found = step()
+            for kind in found if isinstance(found, list) else [found]:
+                trials.append(kind)
+                print(kind.row(), *kind.wrong, sep="\n", flush=True)
+    if given.write:
+        seconds = ", ".join(f"`{command}` {value:.1f} s" for command, value in bench.seconds.items())
+        publish(
+            given.write,
+            trials,
+            f"Made by `python benchmarks/durability.py --kills {given.kills} --seed {given.seed}`; undisturbed, {seconds}.",
+        )
+    return 1 if any(kind.wrong for kind in trials) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
