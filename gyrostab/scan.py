@@ -228,13 +228,16 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     from gyrostab.regularise import gap_table, regularise
     from gyrostab.regularise.fill import count_present
     from gyrostab.schema import log_channels, signal_name, texts
+    from gyrostab.uniform import cut_log
 
     max_gap = reading.get("max_gap", "10D")
-    reading = {name: value for name, value in reading.items() if name not in ("max_gap", "on_file")}
+    cut = {name: reading[name] for name in ("time_from", "time_to", "exclude") if name in reading}
+    reading = {name: value for name, value in reading.items() if name not in ("max_gap", "on_file", *cut)}
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
     log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits"))
+    log = cut_log(log, **cut)
     start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
     signal = log[signal_name(log)]
     notes = dict.fromkeys(note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *texts(log, "notes")])

@@ -49,6 +49,12 @@ class Reading:
         Longest gap; a longer step of the time stamps is taken for a step of the clock.
     strict
         Stop at a damaged or missing file instead of leaving a gap.
+    time_from
+        Use the log from this time on: 2026-11-20T14:00 (UTC), or 10min after its start.
+    time_to
+        Use the log up to this time, in the same manner.
+    exclude
+        Take the samples of a span as missing: 2026-11-20T14:00/2026-11-20T14:05, or 10min/15min after the start. Repeat for more.
     limit
         Raise a limit that a message names: columns=50000. Repeat for more.
     """
@@ -62,6 +68,9 @@ class Reading:
     channel: Annotated[list[Path] | None, Parameter(metavar="FILE", negative=())] = None
     max_gap: Annotated[str, Parameter(metavar="DURATION")] = "10D"
     strict: Flag = False
+    time_from: Annotated[str | None, Parameter(name="--from", metavar="TIME")] = None
+    time_to: Annotated[str | None, Parameter(name="--to", metavar="TIME")] = None
+    exclude: Annotated[list[str] | None, Parameter(metavar="START/END", negative=())] = None
     limit: Annotated[list[str] | None, Parameter(metavar="NAME=NUMBER", negative=())] = None
 
     def given(self) -> dict[str, Any]:

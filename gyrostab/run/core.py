@@ -42,7 +42,15 @@ from gyrostab.run.schedule import Pool, check_scheduler, open_pool
 __all__ = ["load_log", "run", "samples_of"]
 
 
-def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: Any) -> xr.Dataset:
+def load_log(
+    paths: Sequence[str | Path],
+    *,
+    max_gap: str = "10D",
+    time_from: Any = None,
+    time_to: Any = None,
+    exclude: Sequence[Any] = (),
+    **reading: Any,
+) -> xr.Dataset:
     """Read logs in any format and put them on a uniform time axis.
 
     Parameters
@@ -51,6 +59,11 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
         Files, in any order; NetCDF and Zarr logs that gyrostab wrote are joined as they are, without loading them.
     max_gap : str
         Longest gap; a longer step of the stamps is taken for a step of the clock.
+    time_from, time_to : str, datetime or duration, optional
+        Keep the samples from the one up to, but not including, the other: dates and times (ISO 8601, UTC), or durations
+        after the start of the log.
+    exclude : sequence of str or pairs
+        Spans ``"START/END"`` of which the samples are taken as missing; see `gyrostab.uniform.cut_log`.
     **reading
         Options of `gyrostab.read.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``,
         ``strict``, ``limits``, ``on_file``.
@@ -63,6 +76,7 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
     from gyrostab.read import read_log
     from gyrostab.regularise import regularise
     from gyrostab.regularise.notes import describe_channels
+    from gyrostab.uniform import cut_log
 
     log = read_log(paths, max_gap=max_gap, **reading)
     if "sampling_rate_hz" not in log.attrs:
@@ -72,6 +86,7 @@ def load_log(paths: Sequence[str | Path], *, max_gap: str = "10D", **reading: An
             log.attrs["history"] += f" (read with {said})"
     elif reading.get("channel"):
         log = log.assign_attrs(notes=[*log.attrs.get("notes", []), *describe_channels(log)])
+    log = cut_log(log, time_from=time_from, time_to=time_to, exclude=exclude)
     for note in log.attrs.get("notes", []):
         warnings.warn(note, stacklevel=2)
     return log

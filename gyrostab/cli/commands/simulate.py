@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from gyrostab.cli.frame import Output, app, work
 from gyrostab.cli.options import Common, Reading
+from gyrostab.errors import OptionError
 
 __all__ = ["simulate"]
 
@@ -55,6 +56,8 @@ def simulate(
         if like:
             log = make(model, like=load_log(like, **reading.options()), duration=duration, seed=seed)
         else:
+            if reading.time_from or reading.time_to or reading.exclude:
+                raise OptionError("--from, --to and --exclude cut the recording of --like; give that recording too, or --duration")
             log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
         stage("simulating", samples_of(log))
         write = to_zarr if target.suffix.lower() == ".zarr" else to_netcdf
