@@ -58,7 +58,7 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     quick = (tables.columns, tables.weight, tables.to_samples, *diagonals)
     whole = best(lambda: fit_noise(surface), repeats)
     kernel = best(lambda: fit_windows(*flat, *arguments), repeats)
-    block = best(lambda: fit._fit_block(flat, tables, 31), repeats)
+    block = best(lambda: fit._fit_block(flat, tables, 31, True), repeats)
     seconds = [whole, kernel, max(block - kernel, 0.0), max(whole - block, 0.0), best(lambda: identify_noise(*flat, *quick), repeats)]
     once = best(lambda: fit._Tables(ks, shifts, rate, window), 1)
     return ks.size, [1e6 * s / flat[0].shape[0] for s in seconds] + [once]

@@ -57,9 +57,9 @@ def seen_law(product: xr.Dataset, truth: dict[str, float]) -> xr.DataArray:
 
 def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: float) -> str:
     x = lose(rng, simulate(rng, truth), share, block)
-    product = fit_noise(
-        davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=f"{SAMPLES}samples", step=f"{SAMPLES}samples", taus=24)
-    )
+    length = f"{SAMPLES}samples"
+    surface = davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=length, step=length, taus=24)
+    product = fit_noise(surface, observed_only=False)
     limits, law = confidence_interval(product), seen_law(product, truth)
     hit = ((limits.avar_lower <= law) & (law <= limits.avar_upper)).where(product.avar.notnull()).mean(("axis", "time"))
     cells = [f"{float(hit.min()):.3f} .. {float(hit.max()):.3f}"]

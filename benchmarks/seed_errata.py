@@ -266,7 +266,7 @@ def _step_for_walk() -> Erratum:
         "K grows under vibration",
         f"a step D of the mean looks like K = D/√W ({step / math.sqrt(hours):.1f} for 0.27 deg/h in 5 s)",
         "K fitted to white noise with such a step, and its true K [deg/h^1.5]",
-        float(fit_noise(surface, terms="NK")["K"].values.item()),
+        float(fit_noise(surface, terms="NK", observed_only=False)["K"].values.item()),
         0.0,
     )
 

@@ -28,7 +28,7 @@ def analyse(log, run):
     """Go from the log to noise coefficients, and note the processor time of the surface."""
     log, began = log.compute(), time.process_time()
     surface = gyrostab.davar(log, **run["davar"]).assign(windows=lambda made: made.sizes["time"])
-    return gyrostab.fit_noise(surface.assign(seconds=time.process_time() - began), **run.get("fit", {}))
+    return gyrostab.fit_noise(surface.assign(seconds=time.process_time() - began), **{"observed_only": False, **run.get("fit", {})})
 
 
 def number(wanted, products):
