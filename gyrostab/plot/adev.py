@@ -9,7 +9,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.fit import is_described, refit
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import COLOURS, axis_names, axis_style, literal_text, new_figure, stack_panels
 from gyrostab.schema import OBSERVABLE, check_surface
@@ -59,6 +58,8 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     deviation = np.sqrt(window["avar"].values)
     panel.plot(tau, deviation, color=colour, marker="o", markersize=3.5, linewidth=1.2, label=f"axis {name}, measured")
     if "observable" in window:
+        from gyrostab.fit import refit
+
         estimates = refit(windows).isel(axis=0, time=0)
         _draw_terms(panel, window, estimates, [other for other in COLOURS if other != colour])
     panel.set_xscale("log")
@@ -146,6 +147,8 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
 
 def _name_curve(window: xr.Dataset) -> str:
     """Name the fitted curve, with its misfit."""
+    from gyrostab.fit import is_described
+
     chi2, dof = float(window["fit_chi2"]), float(window["fit_dof"])
     if not dof > 0:
         return "sum of the five fitted terms"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -15,7 +15,9 @@ from gyrostab.output import new_output
 from gyrostab.plot.style import duration, embedded
 from gyrostab.report.page import page_text
 from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_product, texts
-from gyrostab.summary import TermSummary, describe_record, summarise_terms
+
+if TYPE_CHECKING:
+    from gyrostab.summary import TermSummary
 
 __all__ = ["write_report"]
 
@@ -52,6 +54,8 @@ def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.D
     check_product(product)
     if log is not None:
         log = as_log(log)
+    from gyrostab.summary import summarise_terms
+
     terms = summarise_terms(product)
     axes = dict.fromkeys(term.axis for term in terms)
     table = [(axis, _coefficients([term for term in terms if term.axis == axis])) for axis in axes]
@@ -127,6 +131,8 @@ def _summary(product: xr.Dataset) -> str:
 
 
 def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]) -> list[str]:
+    from gyrostab.summary import describe_record
+
     lines = []
     for axis, rows in table:
         seen = [f"{row['symbol']} = {row['median']} {row['unit']}{row['rare']}" for row in rows if row["median"] != "–"]
