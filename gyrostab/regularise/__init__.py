@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -18,10 +18,11 @@ from gyrostab.errors import OptionError, TimeError
 from gyrostab.gaps import gap_variables, name_lost
 from gyrostab.limits import check_limits
 from gyrostab.regularise.axes import regularise_axes
+from gyrostab.regularise.course import Course
 from gyrostab.regularise.fill import gathered, on_grid
 from gyrostab.regularise.gaps import find_gaps, gap_table
 from gyrostab.regularise.notes import describe, describe_channels, describe_rate
-from gyrostab.regularise.place import Placement, check_grid, place_by_count, place_by_stamp, place_without_time
+from gyrostab.regularise.place import Placement, check_grid, place_by_count, place_by_course, place_by_stamp, place_without_time
 from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_near, estimate_rate, odd_stretches
 from gyrostab.regularise.repeats import find_repeats, with_repeats
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
@@ -36,6 +37,9 @@ __all__ = ["gap_table", "regularise"]
 
 _DISAGREE = 0.02  # a declared rate further off than this is a mistake
 _EVEN_ROWS = 2**18  # rows at the beginning of a log with even stamps that tell its rate
+_SHARP_SIGMA = 0.2  # jitter up to which a stamp tells its sample, for all rows but one in 100; then they are tried first [samples]
+_MANY_DROPPED = 10  # rows without a sample by their stamps, from which on their order is tried
+_LATE_SHARE = 0.9  # of those rows that the order must give a sample
 _ROUNDS = 4  # a repetition within another shows only when the latter is gone
 _OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "history", "unreadable_spans")
 
@@ -80,21 +84,24 @@ def _place(
             raise
         estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
     if declared is not None and abs(declared / estimate.raw - 1) > _DISAGREE:
-        estimate = estimate_near(stamps, declared) or estimate
-    rate = estimate.rate
-    if declared is not None:
-        if abs(declared / estimate.raw - 1) > _DISAGREE:
+        near = estimate_near(stamps, declared)
+        if near is None or abs(declared / near.raw - 1) > _DISAGREE or near.is_far_worse(estimate):
             raise TimeError(
-                f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz; "
+                f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz, and neither "
+                "lost samples nor jitter explain the difference; "
                 "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of the time column"
             )
-        rate, estimate = declared, replace(estimate, finer=None)  # who gives a rate has decided
+        notes.append(f"{where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, {declared:.10g} Hz, which is used")
+        estimate = near
+    rate = estimate.rate
+    if declared is not None:
+        rate, estimate = declared, replace(estimate, finer=None, even=None)  # who gives a rate has decided
     if estimate.counted:
         placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
-        odd = []
+        odd: list[tuple[int, int, float]] = []
     else:
-        placement = _place_once(raw, found, partial(place_by_stamp, stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where))
-        odd = odd_stretches(stamps, 1e9 / rate)
+        limits = _Limits(tolerance, max_gap, everything, where)
+        placement, odd = _place_stamped(raw, found, stamps, estimate, rate, limits)
     notes += describe_rate(raw, estimate, rate, odd, placement)
     return placement, rate
 
@@ -119,6 +126,39 @@ def _place_even(raw: xr.Dataset, found: Survey, place: Callable[..., tuple[Place
     if notes or fraction or whole != step or placement.runs.tolist() != [[0, 0, _EVEN_ROWS]] or len(placement.events):
         return None
     return replace(placement, runs=np.array([[0, 0, found.rows]], dtype=np.int64)), rate
+
+
+class _Limits(NamedTuple):
+    """What `place_by_course` takes besides."""
+
+    tolerance: float
+    max_gap: float
+    by_row: bool  # unless rows are repetitions, which took no time
+    where: str
+
+
+def _place_stamped(
+    raw: xr.Dataset, found: Survey, stamps: Stamps, estimate: RateEstimate, rate: float, limits: _Limits
+) -> tuple[Placement, list[tuple[int, int, float]]]:
+    """Place the rows by their stamps, or in their order where stamps scatter; and the stretches that have another rate."""
+    course = estimate.course
+
+    def place_along(course: Course) -> Placement:
+        def place() -> Placement:
+            return place_by_course(stamps, course, rate, **limits._replace(by_row=limits.by_row and not found.repeated)._asdict())
+
+        return _place_once(raw, found, place)
+
+    if course is not None and course.sigma > _SHARP_SIGMA:
+        return place_along(course), []
+    tolerance, max_gap, where = limits.tolerance, limits.max_gap, limits.where
+    placement = _place_once(raw, found, partial(place_by_stamp, stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where))
+    dropped = found.rows - found.absent - found.repeated - placement.placed
+    if not found.repeated and (dropped >= _MANY_DROPPED or placement.has_late_rows):  # their order may tell more than their stamps
+        along = place_along(course or Course.of_sharp(1e9 / rate))
+        if along.placed - placement.placed >= _LATE_SHARE * dropped:
+            placement = along
+    return placement, odd_stretches(stamps, 1e9 / rate)
 
 
 def _place_once(raw: xr.Dataset, found: Survey, place: Callable[[], Placement]) -> Placement:

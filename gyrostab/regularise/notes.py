@@ -53,6 +53,21 @@ def describe_rate(
         why = "many rows share one stamp" if estimate.coarse else "the stamps come in bursts, as rows arrive and not as they are sampled"
         reach = f"; stamps and samples differ by up to {duration(placement.wander / rate)} in the long run" if placement.wander >= 1 else ""
         notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
+    course = estimate.course
+    if course is not None and course.group >= 2:
+        why = "many rows share one stamp" if estimate.coarse else "the stamps come in bursts, as rows arrive and not as they are sampled"
+        notes.append(f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are missing where a group comes late")
+    elif course is not None:
+        notes.append(
+            f"{where}: the stamps scatter by {duration(course.sigma / rate)}, {course.sigma:.2g} of a sampling interval, "
+            f"as times of arrival do: rows keep their order at {rate:.10g} Hz, and a missing sample is located to a few rows"
+        )
+    if estimate.even is not None:
+        notes.append(
+            f"{where}: the steps between stamps recur: the stamps fit {rate:.10g} Hz with a share of "
+            f"{1 - estimate.even / rate:.2g} missing, and {estimate.even:g} Hz with none; {rate:.10g} Hz is used: "
+            f"if no rows are missing, give --rate {estimate.even:g}"
+        )
     if estimate.finer is not None:
         notes.append(
             f"{where}: the steps between stamps recur as if a log at {estimate.finer:g} Hz lost the same rows again and again, or as if "

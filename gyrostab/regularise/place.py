@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from gyrostab.errors import TimeError
 from gyrostab.gaps import duration, stamp_text
 from gyrostab.kernels import stamps as kernel
-from gyrostab.kernels.stamps import LOOK, NO_STAMP, RESTART, STEP
+from gyrostab.kernels.stamps import DUPLICATE, LOOK, NO_STAMP, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.limits import describe_limit, is_absurd_grid
-from gyrostab.regularise.rate import RateEstimate, Stamps
+from gyrostab.regularise.course import Course, place_rows
+from gyrostab.regularise.rate import SECOND, RateEstimate, Stamps
 from gyrostab.regularise.survey import file_of
 from gyrostab.store.direct import stretch
 from gyrostab.timegrid import period_ns
 
-__all__ = ["Placement", "check_grid", "place_by_count", "place_by_stamp", "place_without_time"]
+__all__ = ["Placement", "check_grid", "place_by_count", "place_by_course", "place_by_stamp", "place_without_time"]
 
+_NO_STAMPS = "{where}: no row has a readable stamp; check the time column and its unit (--map), or give --rate HZ for a log without time"
 #: Rows that the placement kernel takes at a time.
 _STRETCH = 1 << 18
 
@@ -55,6 +57,12 @@ class Placement:
     def placed(self) -> int:
         """Rows that have a sample."""
         return int(self.runs[:, 2].sum())
+
+    @property
+    def has_late_rows(self) -> bool:
+        """Whether three rows one after the other were dropped, as rows that arrive together after a pause are."""
+        rows = np.sort(self.events[np.isin(self.events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2])
+        return bool((rows[2:] - rows[:-2] == 2).any())
 
 
 def _placement(start: int, runs: list[NDArray[np.int64]], events: list[NDArray[np.int64]], wander: float = 0.0) -> Placement:
@@ -156,9 +164,7 @@ def place_by_stamp(stamps: Stamps, rate: float, *, tolerance: float, max_gap: fl
         runs.append(new)
         events.append(happened)
     if not state[kernel.STARTED]:
-        raise TimeError(
-            f"{where}: no row has a readable stamp; check the time column and its unit (--map), or give --rate HZ for a log without time"
-        )
+        raise TimeError(_NO_STAMPS.format(where=where))
     runs.append(state[kernel.OPEN_RUN][None])
     return _placement(int(state[kernel.FIRST]), runs, events)
 
@@ -273,6 +279,32 @@ def place_by_count(stamps: Stamps, estimate: RateEstimate, rate: float, *, max_g
     if len(numbers):
         numbers[:, 2] = _rows_at(stamps, numbers[:, 2])
     return _placement(start, runs, [numbers], wander)
+
+
+def place_by_course(
+    stamps: Stamps, course: Course, rate: float, *, tolerance: float, max_gap: float, by_row: bool, where: str
+) -> Placement:
+    """Place rows in order where single stamps do not tell the sample: see `gyrostab.regularise.course`.
+
+    Parameters
+    ----------
+    stamps, rate, tolerance, max_gap, where
+        As for `place_by_stamp`.
+    course : Course
+        How the stamps scatter.
+    by_row : bool
+        Rows that `stamps` leaves out took their time all the same.
+
+    Raises
+    ------
+    TimeError
+        When no stamp can be read.
+    """
+    whole, fraction = period_ns(rate)
+    start, runs, events = place_rows(stamps(), course, whole + fraction, hold=0.5 + tolerance, max_gap_ns=max_gap * SECOND, by_row=by_row)
+    if start is None:
+        raise TimeError(_NO_STAMPS.format(where=where))
+    return _placement(start, runs, events)
 
 
 def _rows_at(stamps: Stamps, counts: NDArray[np.int64]) -> NDArray[np.int64]:

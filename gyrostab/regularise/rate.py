@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.kernels.stamps import NO_STAMP, piece_sums, track
+from gyrostab.regularise.course import Course, count_along, find_course, follow_course
 from gyrostab.regularise.steps import cut, finer_period, refined
 from gyrostab.threads import in_order
 
@@ -26,7 +27,11 @@ SECOND = 1e9
 Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 _GAIN = 0.1
 _SURE = 500.0  # samples, of a long log
+_SHARED_SHARE = 0.05  # share of rows with the stamp of the row before from which on stamps may be shared
 _SINGLE = 0.1  # share of the steps that must be one sample of a rate that is given
+#: Scatter of the steps about whole samples up to which single stamps tell the sample: jitter of 0.08 samples, so that half a sample is
+#: 6 standard deviations.
+_SHARP_SCATTER = 0.12
 _MAX_PIECES = 200_000
 _BLOCK = 1 << 20
 
@@ -47,8 +52,12 @@ class RateEstimate:
         Many rows share one stamp.
     raw : float
         The rate before it was rounded to a plain number [Hz].
+    even : float or None
+        Rate [Hz] that the stamps would have if no rows were missing that seem to be missing again and again; None where none do.
     finer : float or None
         Rate [Hz] that the stamps would have if the same rows were missing again and again; None where nothing speaks for one.
+    course : Course or None
+        How the stamps scatter about the samples, where single stamps do not tell the sample but many together do.
     """
 
     rate: float
@@ -56,7 +65,13 @@ class RateEstimate:
     counted: bool
     coarse: bool
     raw: float
+    even: float | None = None
     finer: float | None = None
+    course: Course | None = None
+
+    def is_far_worse(self, other: RateEstimate) -> bool:
+        """Whether the course of another rate explains the stamps much better: by 20 nats in 100 rows, so by 2000 in 10 000."""
+        return self.course is not None and other.course is not None and self.course.nats > other.course.nats + 0.2
 
 
 def _recut(stamps: Stamps, size: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
@@ -114,7 +129,7 @@ def _residual_range(parts: list[NDArray[np.int64]], length: int) -> tuple[NDArra
 
 def _shared(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
     """Whether many rows share a stamp because the clock ticks slowly, and not because rows are doubled."""
-    if np.mean(steps == 0) < 0.05:
+    if np.mean(steps == 0) < _SHARED_SHARE:
         return False
     tick = np.median(steps[steps > 0])
     length = min(512, *(len(part) for part in parts)) if parts else 0
@@ -127,6 +142,12 @@ def _misfit(steps: NDArray[np.float64], period: float) -> float:
     """How far steps are from whole numbers of samples, root mean square [samples]; 0.29 says that they are anywhere."""
     near = steps[np.abs(steps) < 5.5 * period] / period
     return float(np.sqrt(np.mean((near - np.rint(near)) ** 2))) if len(near) else 0.5
+
+
+def _scatter(steps: NDArray[np.float64], period: float) -> float:
+    """Robust standard deviation of the steps about whole numbers of samples [samples]; 0.37 says that they are anywhere."""
+    near = steps[np.abs(steps) < 5.5 * period] / period
+    return 1.4826 * float(np.median(np.abs(near - np.rint(near)))) if len(near) else 0.5
 
 
 def _on_a_line(parts: list[NDArray[np.int64]]) -> float | None:
@@ -217,11 +238,14 @@ def _longest(parts: list[NDArray[np.int64]], period: float) -> float:
     return float(max(SECOND, 50 * period, 10 * np.quantile(np.abs(steps), 0.99)))
 
 
-def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest: float) -> NDArray[np.float64]:
+def _pieces(
+    stamps: Stamps, period: float, counted: bool, coarse: bool, longest: float, course: Course | None = None
+) -> NDArray[np.float64]:
     """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
     table = np.empty((0, 6))
     zero: int | None = None
-    for first, sums in in_order(partial(_piece_sums, period=period, counted=counted, coarse=coarse, longest=longest), stamps()):
+    work = partial(_piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, course=course)
+    for first, sums in in_order(work, stamps()):
         if first is None:
             continue
         zero = first[0] if zero is None else zero
@@ -234,7 +258,13 @@ def _pieces(stamps: Stamps, period: float, counted: bool, coarse: bool, longest:
 
 
 def _piece_sums(
-    found: tuple[NDArray[np.int64], NDArray[np.int64]], *, period: float, counted: bool, coarse: bool, longest: float
+    found: tuple[NDArray[np.int64], NDArray[np.int64]],
+    *,
+    period: float,
+    counted: bool,
+    coarse: bool,
+    longest: float,
+    course: Course | None,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
     """Of one block: its first stamp, that from which the sums count, and the sums of its pieces; None where no stamp is readable."""
     rows, block = found
@@ -242,6 +272,9 @@ def _piece_sums(
     if len(block) == 0:
         return None, np.empty((0, 6))
     first = int(block[0])
+    if course is not None:
+        block, count, piece = count_along(np.arange(len(found[1])), found[1], course, longest)
+        return (first, int(block[0])) if len(block) else None, piece_sums(block, count, piece, period)
     if counted:
         known = np.flatnonzero(rows != NO_STAMP)
         piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
@@ -340,10 +373,39 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         what = "time runs backwards" if (steps < 0).any() else "all stamps are the same"
         raise TimeError(f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ")
     period, counted, coarse = starting_period(parts)
-    longest = _longest(parts, period) if counted else _sure(len(steps)) * period
+    sure = _sure(len(steps))
     finer = None if counted else finer_period(parts, period)
+    lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
+    if lost is not None:
+        return replace(lost, even=_mean_rate(parts))
+    if counted or _scatter(steps, period) > _SHARP_SCATTER or np.mean(steps == 0) >= _SHARED_SHARE:
+        course = _find_course(parts, period, coarse, sure)
+        if course is not None:
+            return _estimate_along(stamps, course, coarse, sure)
+    longest = _longest(parts, period) if counted else sure * period
     estimate = _estimate(_pieces(stamps, period, counted, coarse, longest), period, counted, coarse)
     return estimate if finer is None else replace(estimate, finer=float(f"{SECOND / finer:.4g}"))
+
+
+def _find_course(parts: list[NDArray[np.int64]], period: float, coarse: bool, sure: float) -> Course | None:
+    """The course of noisy stamps: of all rows, or of one row of each group."""
+    once = [part[np.append(np.diff(part) != 0, True)] for part in parts]  # rows may be given twice
+    few = sum(map(len, once)) > (1 - _SHARED_SHARE) * sum(map(len, parts))
+    found = None if coarse else find_course(once if few else parts, [period], "all", sure=sure)
+    return found or find_course(parts, [period], "first" if coarse else "last", sure=sure)
+
+
+def _estimate_along(stamps: Stamps, course: Course, coarse: bool, sure: float) -> RateEstimate:
+    """The rate from the whole course of noisy stamps."""
+    longest = sure * course.period * max(1.0, course.group)
+    pieces = _pieces(stamps, course.period, False, False, longest, course)
+    return replace(_estimate(pieces, course.period, False, False), coarse=coarse, course=course)
+
+
+def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
+    """Rows in a second, those without pauses."""
+    rates = [SECOND * (len(part) - 1) / (part[-1] - part[0]) for part in parts if part[-1] > part[0]]
+    return float(f"{np.median(rates):.4g}")
 
 
 def _sure(steps: int) -> float:
@@ -361,20 +423,35 @@ def _estimate(pieces: NDArray[np.float64], period: float, counted: bool, coarse:
 def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     """The rate near a nominal one [Hz], where the stamps are samples of it of which some are missing, however regularly.
 
-    Of every five rows the same two may be missing: the stamps by themselves then speak for three fifths of the rate. They can be
-    samples of `rate` when their steps are whole numbers of its period and some are one period; otherwise the answer is None.
+    They can be samples of `rate` when their steps are whole numbers of its period and some are one period, or when rows of that rate
+    with lost samples and jitter explain them (see `gyrostab.regularise.course`); otherwise the answer is None.
 
     Examples
     --------
     >>> kept = np.flatnonzero(np.arange(5000) % 5 < 3)
     >>> stamps = lambda: iter([(np.arange(3000), kept * 10_000_000)])
-    >>> estimate_rate(stamps, where="tool.csv").rate, estimate_near(stamps, 100.0).rate
-    (60.0, 100.0)
+    >>> estimate_rate(stamps, where="tool.csv").rate, estimate_near(stamps, 60.0).rate
+    (100.0, 60.0)
     """
     stamps = partial(_recut, stamps, _BLOCK)
     parts = _pools(stamps)
+    if not parts:
+        return None
+    sharp = _estimate_sharp(stamps, parts, rate)
+    if sharp is not None:
+        return sharp
+    sure = _sure(sum(len(part) - 1 for part in parts))
+    for observe in ("all", "last"):
+        course = follow_course(parts, SECOND / rate, observe, sure=sure)
+        if course is not None:
+            return _estimate_along(stamps, course, False, sure)
+    return None
+
+
+def _estimate_sharp(stamps: Stamps, parts: list[NDArray[np.int64]], rate: float) -> RateEstimate | None:
+    """The rate near a nominal one [Hz] where steps are whole numbers of its period, and some are one period."""
     period = SECOND / rate
-    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64) if parts else np.empty(0)
+    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
     single = steps[np.abs(steps / period - 1) < 0.25]
     if len(single) == 0 or len(single) < _SINGLE * len(steps) or _misfit(steps, period) > 0.15:
         return None

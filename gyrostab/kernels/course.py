@@ -1,0 +1,312 @@
+"""The most likely course of noisy stamps along a grid: which rows are the next sample, and where samples are missing.
+
+A stamp is the time of its sample plus jitter. How far the stamps are ahead of the row count, in samples, is then a whole number (the
+samples lost so far) plus jitter, plus a slow phase of the clock. The whole number changes rarely. `trace` finds its most likely course:
+hypotheses are kept side by side until the rows that follow decide between them (a Viterbi search), so no single stamp decides anything.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gyrostab.kernels.compiled import INNER, KERNEL
+
+__all__ = ["find_breaks", "find_phase", "follow", "trace"]
+
+Integers = NDArray[np.int64]
+
+#: Most hypotheses kept side by side: each row that comes late is the possible end of a loss.
+_MOST = 64
+#: Costs, in nats. A stamp beyond 5 standard deviations (12.5 nats) is an outlier, whatever its size. One row in 150 (5 nats) comes after
+#: a loss; a loss of k samples is k times less likely than that of one. A row that has no sample on the grid is as unlikely as 1e-13,
+#: much more than an outlier: rows that are late by many samples for a while are kept.
+_OUTLIER_NATS, _LOSS_NATS, _DROP_NATS = 12.5, 5.0, 30.0
+#: Standard deviations within which the end of a loss is looked for.
+_REACH_SIGMA = 2.5
+#: Of 1000 outliers one after the other; more late rows are none, but come after a loss.
+_LATE_NATS = 12_500.0
+#: Samples lost between the first rows, at most, and rows that a first phase is worth.
+_EARLY_LOSSES, _FIRST_ROWS = 3, 8
+#: Rows that decide whether the clock was set back, or a stamp is damaged.
+_PERSIST_ROWS = 16
+
+
+@njit(**INNER)
+def _keep(table, n, level, phase, cost, parent):  # type: ignore[no-untyped-def]
+    """Add a hypothesis to the first `n` of a table, each level once; returns how many there are then.
+
+    The one with the fewest losses stays whatever it costs: while rows are late, all others are cheaper.
+    """
+    lowest, worst = np.int64(0), np.int64(-1)
+    for h in range(n):
+        if table[h, 0] == level:
+            if cost < table[h, 2]:
+                table[h, 1], table[h, 2], table[h, 3] = phase, cost, parent
+            return n
+        if table[h, 0] < table[lowest, 0]:
+            lowest = np.int64(h)
+    at = n
+    if n == _MOST:
+        for h in range(n):
+            if h != lowest and (worst < 0 or table[h, 2] > table[worst, 2]):
+                worst = np.int64(h)
+        if cost >= table[worst, 2]:
+            return n
+        at, n = worst, n - 1
+    table[at, 0], table[at, 1], table[at, 2], table[at, 3] = level, phase, cost, parent
+    return n + 1
+
+
+@njit(**INNER)
+def _switch_nats(far):  # type: ignore[no-untyped-def]
+    """Cost of going `far` samples ahead (a loss), or back (rows without a sample)."""
+    if far > 0:
+        return _LOSS_NATS + np.log(far)
+    return min(-_DROP_NATS * far, _LATE_NATS)
+
+
+@njit(**INNER)
+def _stamp_nats(off, weight):  # type: ignore[no-untyped-def]
+    """Cost of a stamp that is `off` samples from its course; of two outliers, the nearer is a little cheaper."""
+    nats = weight * off * off
+    return nats if nats < _OUTLIER_NATS else _OUTLIER_NATS + 0.05 * np.log(nats / _OUTLIER_NATS)
+
+
+@njit(**INNER)
+def _prune(table, n):  # type: ignore[no-untyped-def]
+    """Drop the hypotheses that the best one could still become at less cost; returns how many remain."""
+    best = np.int64(0)
+    for h in range(n):
+        if table[h, 2] < table[best, 2]:
+            best = np.int64(h)
+    level, cost = table[best, 0], table[best, 2]
+    kept = np.int64(0)
+    for h in range(n):
+        far = table[h, 0] - level
+        if far == 0.0 or table[h, 2] < cost + _switch_nats(far):
+            for c in range(4):
+                table[kept, c] = table[h, c]
+            kept += 1
+    return kept
+
+
+@njit(**INNER)
+def _extend(new, kept, old, h, position, following, sigma, gain, hold):  # type: ignore[no-untyped-def]
+    """Add to a table what hypothesis h becomes with a row that lies at `position`, and the next at `following`; the new length."""
+    level, phase, cost = old[h, 0], old[h, 1], old[h, 2]
+    weight = 0.5 / sigma**2
+    if phase > hold:
+        level, phase = level + 1.0, phase - 1.0
+    elif phase < -hold:
+        level, phase = level - 1.0, phase + 1.0
+    off = position - level - phase
+    step = gain * off if weight * off * off < _OUTLIER_NATS else 0.0
+    kept = _keep(new, kept, level, phase + step, cost + _stamp_nats(off, weight), h)
+    low, far = np.rint(off - _REACH_SIGMA * sigma), np.rint(off + _REACH_SIGMA * sigma)
+    while far >= low:  # a loss whose end this row may be, or a row too many
+        if far > 0.0 or (far < 0.0 and far == np.rint(off)):
+            rest = off - far
+            dear = cost + _switch_nats(far) + _stamp_nats(rest, weight)
+            kept = _keep(new, kept, level + far, phase + gain * rest, dear, h)
+        far -= 1.0
+    ahead = np.rint(following - level - phase)
+    if ahead >= 1.0 and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5:  # a loss of which the next row shows the end
+        dear = cost + _switch_nats(ahead) + _stamp_nats(off - ahead, weight)
+        kept = _keep(new, kept, level + ahead, phase, dear, h)
+    return kept
+
+
+@njit(**INNER)
+def _seed(table, level, phase, first):  # type: ignore[no-untyped-def]
+    """Begin with a hypothesis; where the first row of a piece is at `first`, samples may be lost between the first rows."""
+    table[0, 0], table[0, 1], table[0, 2] = level, phase, 0.0
+    size = np.int64(1)
+    if not np.isnan(first):
+        for lost in range(1, 1 + _EARLY_LOSSES):
+            size = _keep(table, size, level - lost, phase, 0.0, np.int64(0))
+        size = _keep(table, size, np.rint(first - phase), phase, _LOSS_NATS, np.int64(0))  # or many, just after the first
+    return size
+
+
+@njit(**KERNEL)
+def trace(count, stamps, count0, stamp0, period, sigma, gain, hold, level0, phase0, seen, levels, phases):  # type: ignore[no-untyped-def]
+    """Find the most likely course of the stamps of rows.
+
+    Parameters
+    ----------
+    count, stamps : ndarray of int64, shape (n,)
+        Row count, rising, and stamp [ns].
+    count0, stamp0 : int
+        Count and stamp [ns] of sample 0.
+    period : float
+        Sampling period [ns].
+    sigma : float
+        Standard deviation of the jitter [samples].
+    gain : float
+        Share of a deviation that the phase takes over: it averages the jitter of the last ``1 / gain`` rows.
+    hold : float
+        A phase further from zero than this is turned into a sample left out, or a row dropped [samples].
+    level0, phase0 : int, float
+        Samples lost so far, and phase of the clock [samples].
+    seen : int
+        Rows that `phase0` averages; 0 at the beginning, where `level0` and fewer by up to 3 are all as likely.
+    levels, phases : ndarray of int64 and float64, shape (n,)
+        Filled with the samples lost up to each row, and the phase after it.
+
+    Returns
+    -------
+    float
+        Cost of the course [nats].
+    """
+    n = len(count)
+    old, new = np.empty((_MOST, 4)), np.empty((_MOST, 4))
+    parents = np.empty((n, _MOST), dtype=np.int8)
+    table = np.empty((n, _MOST, 2))
+    first = (stamps[0] - stamp0) / period - (count[0] - count0) if seen == 0 and n > 0 else np.nan
+    size = _seed(old, level0, phase0, first)
+    for i in range(n):
+        position = (stamps[i] - stamp0) / period - (count[i] - count0)
+        after = min(i + 1, n - 1)
+        following = (stamps[after] - stamp0) / period - (count[after] - count0)
+        follows = max(gain, 1.0 / (max(seen, _FIRST_ROWS) + i + 1.0))
+        kept = np.int64(0)
+        for h in range(size):
+            kept = _extend(new, kept, old, h, position, following, sigma, follows, hold)
+        size = _prune(new, kept) if kept > 1 else kept
+        for h in range(size):
+            table[i, h, 0], table[i, h, 1], parents[i, h] = new[h, 0], new[h, 1], np.int8(new[h, 3])
+        old, new = new, old
+    best = np.int64(0)
+    for other in range(size):
+        if old[other, 2] < old[best, 2]:
+            best = np.int64(other)
+    total = old[best, 2]
+    for i in range(n - 1, -1, -1):
+        levels[i], phases[i] = np.int64(table[i, best, 0]), table[i, best, 1]
+        best = np.int64(parents[i, best])
+    return total
+
+
+@njit(**KERNEL)
+def find_breaks(stamps, n, latest, reach, longest):  # type: ignore[no-untyped-def]
+    """Find the rows at which the clock is set back, or ahead by more than a gap may last.
+
+    Parameters
+    ----------
+    stamps : ndarray of int64
+        Stamps [ns], all readable; some more than `n`.
+    n : int
+        Stamps to look at; the rest is what follows.
+    latest : int
+        Latest stamp before [ns].
+    reach : float
+        How far a stamp may lie behind the latest one by jitter [ns].
+    longest : float
+        Longest gap [ns].
+
+    Returns
+    -------
+    breaks : ndarray of int64, shape (m, 2)
+        Row and latest stamp before it [ns].
+    latest : int
+        Latest stamp of the first `n` [ns].
+    """
+    breaks = np.empty((n, 2), dtype=np.int64)
+    found = np.int64(0)
+    for j in range(n):
+        end = min(len(stamps), j + 1 + _PERSIST_ROWS)
+        if stamps[j] < latest - reach or stamps[j] > latest + longest:
+            back = stamps[j] < latest
+            lasting = j + 1 < end
+            for m in range(j + 1, end):
+                if (back and stamps[m] > latest) or (not back and stamps[m] < latest + longest):
+                    lasting = False
+                    break
+            if not lasting:
+                continue
+            breaks[found, 0], breaks[found, 1] = j, latest
+            found += 1
+            latest = stamps[j]
+        elif stamps[j] > latest:
+            after = stamps[j]  # a damaged stamp is ahead of all that follow
+            if j + 1 < end and stamps[j + 1] < after - reach:
+                after = stamps[j + 1]
+                if j + 2 < end:
+                    after = max(after, stamps[j + 2])
+            latest = max(latest, min(stamps[j], after))
+    return breaks[:found].copy(), latest
+
+
+@njit(**KERNEL)
+def find_phase(count, stamps, period, sigma):  # type: ignore[no-untyped-def]
+    """Find how far the first stamps are ahead of the count of rows, from the first of them [samples].
+
+    Lost samples and late rows put stamps ahead, so of up to 33 rows those count that are least ahead; three of them at least, as one
+    stamp may be damaged.
+    """
+    n = min(len(count), 33)
+    ahead = np.empty(n)
+    for i in range(n):
+        ahead[i] = (stamps[i] - stamps[0]) / period - (count[i] - count[0])
+    ahead.sort()
+    for i in range(n - 2):
+        end = i + 1
+        while end < n and ahead[end] < ahead[i] + 1.0 + 4.0 * sigma:
+            end += 1
+        if end - i >= 3:
+            return np.median(ahead[i:end])
+    return np.median(ahead)
+
+
+@njit(**KERNEL)
+def follow(count, stamps, period, sigma, gain, longest, block):  # type: ignore[no-untyped-def]
+    """Count the samples along noisy stamps, as `gyrostab.kernels.stamps.track` does along sharp ones.
+
+    Parameters
+    ----------
+    count, stamps : ndarray of int64, shape (n,)
+        Row count, rising, and stamp [ns].
+    period : float
+        Approximate sampling period [ns].
+    sigma : float
+        Standard deviation of the jitter [samples].
+    gain : float
+        As for `trace`.
+    longest : float
+        A longer step starts a new piece [ns].
+    block : int
+        Rows traced at one time, at most.
+
+    Returns
+    -------
+    sample, piece : ndarray of int64, shape (n,)
+        Sample number within the piece, and number of the piece.
+    off : ndarray, shape (n,)
+        Deviation of each stamp from the course [samples].
+    cost : float
+        Cost of the course [nats].
+    """
+    n = len(stamps)
+    sample, piece = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    off = np.empty(n)
+    number, total = np.int64(0), 0.0
+    begin = np.int64(0)
+    while begin < n:
+        end = begin + 1
+        while end < n and end - begin < block and abs(stamps[end] - stamps[end - 1]) <= longest:
+            end += 1
+        phase = find_phase(count[begin:end], stamps[begin:end], period, sigma)
+        level = sample[begin:end]
+        total += trace(
+            count[begin:end], stamps[begin:end], count[begin], stamps[begin], period, sigma, gain, np.inf,
+            np.int64(0), phase, np.int64(0), level, off[begin:end],
+        )  # fmt: skip
+        for i in range(begin, end):
+            sample[i] += count[i] - count[begin]
+            off[i] = (stamps[i] - stamps[begin]) / period - sample[i] - off[i]
+            piece[i] = number
+        number += 1
+        begin = end
+    return sample, piece, off, total
