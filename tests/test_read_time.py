@@ -168,3 +168,22 @@ def test_an_epoch_that_is_not_used_is_said(tmp_path):
     raw = read_log(write_stamped(tmp_path / "log.nc", np.arange(ROWS), units="seconds since 2026-01-02"), epoch="2020-01-01")
     assert raw.time.values[0] == np.datetime64("2026-01-02")
     assert any("--epoch is not used" in note for note in raw.attrs["notes"])
+
+
+def test_dates_of_las_files_are_counted_or_read(tmp_path):
+    rows = "\n".join(f"{1500 if row == 7 else 2026}-05-06 00:00:{row:02d} {row}" for row in range(ROWS))
+    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nNULL. -999.25 :\n~C\nDATE. : date\nTIME. : time\nGYRO_X.deg/h : rate\n~A\n"
+    path = tmp_path / "log.las"
+    path.write_text(head + rows + "\n")
+    stamps = read_log(path).time.values
+    assert np.flatnonzero(np.isnat(stamps)).tolist() == [7]
+    assert stamps[8] == np.datetime64("2026-05-06T00:00:08")
+
+
+def test_a_tdms_waveform_that_begins_after_2262_is_refused(tmp_path):
+    nptdms = pytest.importorskip("nptdms")
+    begin = {"wf_increment": 0.01, "wf_start_time": np.datetime64("2300-01-01", "us"), "unit_string": "deg/h"}
+    with nptdms.TdmsWriter(tmp_path / "log.tdms") as writer:
+        writer.write_segment([nptdms.ChannelObject("imu", "gyro_x", np.arange(40.0), properties=begin)])
+    with pytest.raises(FormatError, match=r"log\.tdms: .*2262"):
+        read_log(tmp_path / "log.tdms")

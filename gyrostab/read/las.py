@@ -20,6 +20,7 @@ from gyrostab.read.arrays import holds_dates
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.optional import library
 from gyrostab.read.options import FileSummary, ReadOptions
+from gyrostab.read.stamps import dates_to_ns
 from gyrostab.read.tables import Table, read_tables, scan_tables
 
 __all__ = ["matches", "read", "scan"]
@@ -81,7 +82,7 @@ def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
     if order is None:
         fix = "write the dates as 2026-03-14, or drop the curve with --map DATE=-"
         raise FormatError(f"{path.name}: the order of day and month in the curve DATE ({days[0]!r}) is not clear; {fix}")
-    start = pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy(dtype="datetime64[ns]")
+    start = dates_to_ns(pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy()).view("datetime64[ns]")
     clock = pd.Series(time.data)
     if clock.dtype.kind not in "iuf":
         since = pd.to_timedelta(clock.astype(str).str.strip(), errors="coerce").to_numpy(dtype="timedelta64[ns]")

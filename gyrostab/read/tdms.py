@@ -60,12 +60,12 @@ def _tables(path: Path) -> Iterator[list[Table]]:
         names = plain_names([(channel.group_name, channel.name) for channel in channels])
         found: dict[Any, list[tuple[str, Any]]] = {}
         for name, channel in zip(names, channels, strict=True):
-            clock = _clock(channel)
+            clock = _clock(path, channel)
             found.setdefault((len(channel), clock or channel.group_name), []).append((name, channel))
-        yield [_table(members, _clock(members[0][1])) for members in found.values()]
+        yield [_table(members, _clock(path, members[0][1])) for members in found.values()]
 
 
-def _clock(channel: Any) -> tuple[float, Any] | None:
+def _clock(path: Path, channel: Any) -> tuple[float, Any] | None:
     """Interval [s] and start of a waveform."""
     properties = channel.properties
     step = float(properties.get("wf_increment") or 0.0)
@@ -76,7 +76,9 @@ def _clock(channel: Any) -> tuple[float, Any] | None:
     if start is not None:
         began = int(dates_to_ns(np.array(start)))
         if began == NAT:
-            raise FormatError(f"channel {channel.name!r} begins at {start}, which is after the year 2262; correct wf_start_time")
+            raise FormatError(
+                f"{path.name}: channel {channel.name!r} begins at {start}, which is after the year 2262; correct wf_start_time"
+            )
         start = np.datetime64(began, "ns")
     offset = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
     return step, offset if start is None else start + np.timedelta64(offset, "ns")
