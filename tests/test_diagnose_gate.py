@@ -193,6 +193,7 @@ def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: b
         assert held["forecast_gain"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_turn_on_the_bench_is_not_explained_by_what_fails_its_forecast(recordings: Callable[[str], Path]):
     """A real record of 27 s whose rate turns to 123 deg/s at its end; the limits of what was not found once stopped the diagnosis."""
     path = recordings("fog-hybrid-warmup/run2_turn.txt")

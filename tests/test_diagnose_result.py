@@ -6,6 +6,7 @@ import copy
 import json
 import re
 import tomllib
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.diagnose.conclusion.result import VERDICTS, Diagnosis, check_diagnosis, effect_table, model_text, plain
-from gyrostab.diagnose.conclusion.sentences import chance, clock, mismatch_statement, next_measurement, plain_name, summary
+from gyrostab.diagnose.conclusion.sentences import (
+    chance,
+    clock,
+    mismatch_statement,
+    next_measurement,
+    plain_name,
+    summary,
+    unsized_statement,
+)
 from gyrostab.diagnosis_folder import FILES, open_diagnosis, write_diagnosis
 from gyrostab.errors import FormatError, OutputError, SchemaError
 from gyrostab.physics.registry import effects, make_effect
@@ -359,3 +368,24 @@ def test_a_diagnosis_prints_its_verdict_and_sentences():
     assert text.startswith("explained: There are 2 places")
     assert "- vibration_noise: Vibration raises the noise" in text
     assert make_effect({"name": "vibration_noise", "white": 0.00045, "axes": ["x"]}).say({"white": 2.25e-5}) in text
+
+
+@plain_pages
+def test_a_page_of_many_mismatches_gives_their_chance_in_a_column(tmp_path: Path):
+    """24 places: the words on chance are said once for all of them, and each has its number."""
+    one = diagnosis()
+    box = one.content["mismatches"][0] | {"p_value": 1e-12, "explained_by": []}
+    box["statement"] = "Axis x is noisier than simulated (noise alone does that in fewer than 1 of a million such records)."
+    boxes = [box | {"id": number} for number in range(1, 25)]
+    many = replace(one, content=one.content | {"mismatches": boxes, "unexplained": list(range(1, 25)), "effects": []})
+    text = write_diagnosis_report(many, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert text.count("<td>fewer than 1 of a million</td>") == 24
+    assert "noise alone does that" not in text
+    assert str(many).count("of a million") == 1
+
+
+def test_effects_without_a_size_have_a_whole_sentence():
+    motion = make_effect({"name": "real_motion", "x": 0.02, "axes": ["z"]})
+    assert motion.say() == "The tool really rotates on axis z: tilt 0.02 mrad/g along x."
+    text = unsized_statement("real_motion", ["x", "z"])
+    assert text == "The record shows real rotation of the tool, not a sensor error, on axes x and z. It does not give a size."
