@@ -46,7 +46,7 @@ def run(path, target, windows, workers):
     run([path], target, windows=windows, overwrite=True, workers=workers)
 def read_xarray(path, target, windows, workers):
     import xarray as xr
-    engine = "zarr" if path.endswith(".zarr") else "h5netcdf" if path.endswith((".h5", ".mat")) else None
+    engine = "zarr" if path.endswith(".zarr") else None
     with xr.open_dataset(path, chunks={"time": 2**21}, engine=engine) as data:
         print([float(data[name].mean()) for name in data.data_vars], file=sys.stderr)
 def peak():
@@ -229,7 +229,7 @@ def compare(folder: Path, hours: float, given: argparse.Namespace) -> list[list[
         path = write(folder / f"{name}.{ending}", hours, given.jitter)
         size = size_of(path)
         run = measure("run", path, given)
-        peer = measure("read_xarray", path, given) if ending in ("nc", "zarr", "h5") and not name.startswith("own") else None
+        peer = measure("read_xarray", path, given) if ending in ("nc", "zarr") and not name.startswith("own") else None
         shutil.rmtree(path) if path.is_dir() else path.unlink()
         reference = reference or (run["seconds"] if run else None)
         ran = ["failed", "", "", ""]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,14 @@ from gyrostab.limits import check_stored
 from gyrostab.read.arrays import batch_rows, convert_batch, float32_note, holds_dates, summarise
 from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
-from gyrostab.read.intake import Intake
+from gyrostab.read.intake import Intake, Taken
 from gyrostab.read.options import FileSummary, ReadOptions
+from gyrostab.threads import in_order
 
 __all__ = ["matches", "read", "scan"]
+
+#: Bytes of a column that are read at one time: without a buffer, those of a whole row group, which may be a whole log.
+_BUFFER_BYTES = 2**20
 
 
 def matches(path: Path) -> bool:
@@ -33,7 +38,9 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
     def fetch(source: int, start: int, stop: int) -> Any:
         group = 0 if start == 0 else file.num_row_groups - 1
-        values = _plain(file.read_row_group(group, columns=[file.schema_arrow.names[source]]).column(0))
+        parts = file.iter_batches(batch_size=batch_rows(1), row_groups=[group], columns=[file.schema_arrow.names[source]])
+        part = next(parts) if start == 0 else deque(parts, maxlen=1)[0]
+        values = _plain(part.column(0))
         return values[: stop - start] if start == 0 else values[start - stop :]
 
     return summarise("parquet", plan, options, file.metadata.num_rows, fetch)
@@ -46,9 +53,13 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
     intake = Intake(plan.check(), options, limit=limit)
     wanted = [names[column.source] for column in plan.columns]
-    for batch in file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted):
+
+    def convert(batch: Any) -> Taken:
         found = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
-        intake.add(convert_batch(intake, options, {column.source: _plain(found[names[column.source]]) for column in plan.columns}))
+        return convert_batch(intake, options, {column.source: _plain(found[names[column.source]]) for column in plan.columns})
+
+    for taken in in_order(convert, file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted)):
+        intake.add(taken)
     return intake.finish(float32_note(plan, file.schema_arrow.types))
 
 
@@ -57,7 +68,7 @@ def _look(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
     from pyarrow import parquet
 
     try:
-        file = parquet.ParquetFile(path)
+        file = parquet.ParquetFile(path, buffer_size=_BUFFER_BYTES, pre_buffer=False)
         schema = file.schema_arrow
         head = next(file.iter_batches(batch_size=50), None)
     except (pa.ArrowException, OSError) as error:

@@ -6,9 +6,11 @@ where its numbers lie: at even distances (`EvenRows`), or in chunks (`ChunkedRow
 
 from __future__ import annotations
 
+import math
 import threading
 import uuid
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -29,6 +31,8 @@ _SPREAD_BYTES = 2**23
 _MOST_CHUNKS = 2**19
 #: Chunks from this size on are decoded by one thread at a time.
 _LARGE_BYTES = 2**24
+#: Small chunks of one column that were not wanted whole: the next part of a run begins in them.
+_EDGES = KeptChunks(2**26, _LARGE_BYTES)
 #: A part of a run has up to 2**24 samples (128 MiB) of all axes, and each of two workers may find all of them in the same chunks.
 _KEPT = KeptChunks(3 * 2**27, 2**28)
 _DECODING = threading.Lock()
@@ -126,25 +130,24 @@ class ChunkedRows:
                 across, rest = divmod(self.place, self.chunks[1 - self.along])
                 at, inside = ((number, across), (inside, rest)) if self.along == 0 else ((across, number), (rest, inside))
             alone = len(self.shape) == 1 or self.chunks[1 - self.along] == 1
-            chunk = self._chunk(at, kept=not alone or low > first or high < min(first + length, self.shape[self.along]))
+            part = low > first or high < min(first + length, self.shape[self.along])
+            chunk = self._chunk(at, alone=alone, part=part)
             out[low - start : high - start] = self.fill if chunk is None else chunk[inside]
         return out
 
-    def _chunk(self, at: tuple[int, ...], *, kept: bool) -> NDArray[Any] | None:
-        """Return a chunk; one that will be wanted again is kept."""
-        chunk = _KEPT.find((*self.key, at))
+    def _chunk(self, at: tuple[int, ...], *, alone: bool, part: bool) -> NDArray[Any] | None:
+        """Return a chunk; one that will be wanted again, by another column or for its other rows, is kept."""
+        large = math.prod(self.chunks) * self.dtype.itemsize >= _LARGE_BYTES
+        kept, key = _EDGES if alone and not large else _KEPT, (*self.key, at)
+        chunk = kept.find(key)
         if chunk is not None:
             return chunk
-        if np.prod(self.chunks) * self.dtype.itemsize >= _LARGE_BYTES:
-            with _DECODING:
-                chunk = _KEPT.find((*self.key, at))
-                return self._load(at, kept=kept) if chunk is None else chunk
-        return self._load(at, kept=kept)
-
-    def _load(self, at: tuple[int, ...], *, kept: bool) -> NDArray[Any] | None:
-        chunk = self.load(at)
-        if kept and chunk is not None:
-            _KEPT.keep((*self.key, at), chunk)
+        with _DECODING if large else nullcontext():
+            chunk = kept.find(key) if large else None
+            if chunk is None:
+                chunk = self.load(at)
+                if chunk is not None and (part or not alone):
+                    kept.keep(key, chunk)
         return chunk
 
 
