@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -63,3 +64,10 @@ def test_what_a_run_leaves_is_known_at_every_stage(tmp_path):
     (folder / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"notes\.txt: .*gyrostab did not make what is there"):
         check_job_folder(folder)
+
+
+def test_the_published_table_has_no_loss():
+    page = (Path(__file__).resolve().parents[1] / "docs" / "durability.md").read_text(encoding="utf-8")
+    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ") and line.split(" | ")[1].strip().isdigit()]
+    assert len(rows) == 11
+    assert all(trials == good for _, trials, _, good in rows)
