@@ -33,7 +33,7 @@ def page(totals: Mapping[str, Tally], *, count: int, seed: int, jobs: int, secon
     failures = [failure for tally in totals.values() for failure in tally.failures]
     kinds = Counter(f"{failure['format']}, `{failure['command']}`: {failure['code']}" for failure in failures)
     listed = "\n".join(f"- {kind} ({number} inputs)" for kind, number in kinds.most_common()) or "None."
-    done = "" if tried == count else f" The campaign was stopped after {tried} of {count} inputs."
+    done = "" if tried == count else f"\nThe campaign was stopped after {tried} of {count} inputs."
     return PAGE.format(
         tried=tried, count=count, seed=seed, jobs=jobs, minutes=seconds / 60.0, speed=tried / max(seconds, 1e-9), table=table(totals),
         listed=listed, done=done, limit_seconds=LIMIT_SECONDS, limit_memory=LIMIT_BYTES / 2**20,
@@ -42,23 +42,25 @@ def page(totals: Mapping[str, Tally], *, count: int, seed: int, jobs: int, secon
 
 PAGE = """# Damaged and hostile inputs
 
-Whatever a file contains, gyrostab answers with exit code 0 (done) or 2 (one message that names the file), soon and in bounded
-memory. A run that continues from a damaged checkpoint may also end with 3. Exit code 1, a traceback, a signal, more than
-{limit_seconds:.0f} s or more than {limit_memory:.0f} MiB of additional memory for one of these tiny inputs is a failure. An exception that
-our own code raises is a failure even where the user would see it as a damaged file (`gyrostab.errors.DamageError`).
+Whatever a file contains, gyrostab answers with exit code 0 (done) or 2 (one message that names the file), soon
+and in bounded memory. A run that continues from a damaged checkpoint may also end with 3. Exit code 1, a
+traceback, a signal, more than {limit_seconds:.0f} s or more than {limit_memory:.0f} MiB of additional memory
+for one of these tiny inputs is a failure. An exception that our own code raises is a failure even where the
+user would see it as a damaged file (`gyrostab.errors.DamageError`).
 
-The inputs start from small valid files of every format. A mutator flips bits, overwrites counters and sizes with critical integers,
-cuts, inserts, repeats and splices bytes, replaces tokens of text, and removes or exchanges files of a folder. The rows
-*odd logs*, *odd options* and *odd models* are well-formed inputs that hypothesis draws from grammars: stamps with bursts,
-repeats and clock steps, extreme numbers, names and units. Each input goes through `scan`, `ingest`, `run`, `davar` or `simulate`.
-A child process with the program loaded serves the calls; every input follows from the seed, the format and its number.
+The inputs start from small valid files of every format. A mutator flips bits, overwrites counters and sizes
+with critical integers, cuts, inserts, repeats and splices bytes, replaces tokens of text, and removes or
+exchanges files of a folder. The rows *odd logs*, *odd options* and *odd models* are well-formed inputs that
+hypothesis draws from grammars: stamps with bursts, repeats and clock steps, extreme numbers, names and units.
+Each input goes through `scan`, `ingest`, `run`, `davar` or `simulate`. A child process with the program loaded
+serves the calls; every input follows from the seed, the format and its number.
 
     make fuzz N=100000            # SEED=1 JOBS=2; start it again to continue a campaign that was stopped
     python -m tests.fuzz --replay fuzz-output/failures
 
 ## Results
 
-{tried} inputs (seed {seed}, {jobs} processes) took {minutes:.1f} minutes, {speed:.0f} inputs per second.{done}
+Seed {seed}, jobs {jobs}: {tried} inputs took {minutes:.1f} minutes, {speed:.0f} inputs per second.{done}
 
 {table}
 
