@@ -68,7 +68,7 @@ def _layout(path: Path) -> tuple[Path, dict[str, Any]]:
         )
     try:
         return place, tomllib.loads(place.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise OptionError(f"{place.name}: this layout is no TOML ({error}); correct it") from error
 
 

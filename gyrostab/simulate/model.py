@@ -123,7 +123,7 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
             tables = tomllib.loads(text)
         except OSError as error:
             raise FormatError(f"{path}: cannot be read ({error.strerror})") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise FormatError(f"{path}: not a TOML file ({error})") from error
     known = ("log", "noise", "effect", "environment")
     for key, table in tables.items():
