@@ -370,7 +370,8 @@ def main() -> int:
         publish(
             given.write,
             trials,
-            f"Made by `python benchmarks/durability.py --kills {given.kills} --seed {given.seed} --minutes {given.minutes:g}`; undisturbed, {seconds}.",
+            f"Made by `python benchmarks/durability.py --kills {given.kills} --seed {given.seed} --minutes {given.minutes:g}`; "
+            f"undisturbed, {seconds}.",
         )
     return 1 if any(kind.wrong for kind in trials) else 0
 
