@@ -23,7 +23,7 @@ from gyrostab.regularise.fill import gathered, on_grid
 from gyrostab.regularise.gaps import find_gaps, gap_table
 from gyrostab.regularise.notes import describe, describe_channels, describe_rate
 from gyrostab.regularise.place import Placement, check_grid, place_by_count, place_by_course, place_by_stamp, place_without_time
-from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_near, estimate_rate, odd_stretches
+from gyrostab.regularise.rate import RateEstimate, Stamps, estimate_near, estimate_rate, is_far_worse, odd_stretches
 from gyrostab.regularise.repeats import find_repeats, with_repeats
 from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
@@ -85,7 +85,8 @@ def _place(
         estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
     if declared is not None and abs(declared / estimate.raw - 1) > _DISAGREE:
         near = estimate_near(stamps, declared)
-        if near is None or abs(declared / near.raw - 1) > _DISAGREE or near.is_far_worse(estimate):
+        named = estimate.even is not None and abs(declared / estimate.even - 1) <= _DISAGREE  # the other reading of recurring losses
+        if near is None or abs(declared / near.raw - 1) > _DISAGREE or (not named and is_far_worse(stamps, near, estimate)):
             raise TimeError(
                 f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz, and neither "
                 "lost samples nor jitter explain the difference; "

@@ -71,6 +71,11 @@ class Course:
     nats: float
     fits: bool = True
 
+    @property
+    def code_length(self) -> float:
+        """Nats that it takes to write a stamp down: those of its course, and of its deviation to the nanosecond."""
+        return self.nats + float(np.log(max(self.sigma, LEAST_SIGMA) * self.period))
+
     @classmethod
     def of_sharp(cls, period: float) -> Course:
         """Make the course of stamps that scatter by less than a tenth of a sample."""
@@ -122,13 +127,8 @@ def find_course(parts: list[Integers], guesses: list[float], observe: str, *, su
     best = sorted(periods, key=lambda period: _cost(sample, period, sigma_ns, sure))[:_MOST_REFINED]
     started = [*((period, sigma_ns / period) for period in best), *((guess, LEAST_SIGMA) for guess in guesses)]
     found = [_refine(seen, Course(period, sigma, observe, group, np.inf), sure) for period, sigma in started]
-    explained = min(filter(None, found), key=_code_length, default=None)
+    explained = min(filter(None, found), key=lambda course: course.code_length, default=None)
     return explained if explained is not None and explained.fits else None  # the best may be stamps of rows that are given twice
-
-
-def _code_length(course: Course) -> float:
-    """Nats that it takes to write a stamp down: those of its course, and of its deviation to the nanosecond."""
-    return course.nats + float(np.log(max(course.sigma, LEAST_SIGMA) * course.period))
 
 
 def follow_course(parts: list[Integers], period: float, observe: str, *, sure: float) -> Course | None:

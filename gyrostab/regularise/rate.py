@@ -20,7 +20,7 @@ from gyrostab.regularise.course import Course, count_along, find_course, follow_
 from gyrostab.regularise.steps import cut, finer_period, refined
 from gyrostab.threads import in_order
 
-__all__ = ["RateEstimate", "Stamps", "estimate_near", "estimate_rate", "odd_stretches", "starting_period"]
+__all__ = ["RateEstimate", "Stamps", "estimate_near", "estimate_rate", "is_far_worse", "odd_stretches", "starting_period"]
 
 SECOND = 1e9
 #: Gives the blocks of row numbers and stamps, from the first on, as often as asked.
@@ -34,6 +34,7 @@ _SINGLE = 0.1  # share of the steps that must be one sample of a rate that is gi
 #: 6 standard deviations.
 _SHARP_SCATTER = 0.12
 _MAX_PIECES = 200_000
+_FAR_WORSE_NATS = 0.2  # a row
 _BLOCK = 1 << 20
 
 
@@ -69,10 +70,6 @@ class RateEstimate:
     even: float | None = None
     finer: float | None = None
     course: Course | None = None
-
-    def is_far_worse(self, other: RateEstimate) -> bool:
-        """Whether the course of another rate explains the stamps much better: by 20 nats in 100 rows, so by 2000 in 10 000."""
-        return self.course is not None and other.course is not None and self.course.nats > other.course.nats + 0.2
 
 
 def _recut(stamps: Stamps, size: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
@@ -454,6 +451,24 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
         if course is not None:
             return _estimate_along(stamps, course, False, sure)
     return None
+
+
+def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> bool:
+    """Tell whether a rate explains the stamps much worse than the rate found from them: by 20 nats in 100 rows, so by 2000 in 10 000.
+
+    Both are compared along the most likely course of the stamps, also where single stamps tell the sample of the rate found.
+
+    Examples
+    --------
+    >>> stamps = lambda: iter([(np.arange(3000), np.arange(3000) * 10_000_000)])
+    >>> is_far_worse(stamps, estimate_near(stamps, 110.0), estimate_rate(stamps, where="tool.csv"))
+    True
+    """
+    theirs = found.course
+    if theirs is None and not found.counted:
+        parts = _pools(partial(_recut, stamps, _BLOCK))
+        theirs = follow_course(parts, SECOND / found.raw, "all", sure=_sure(sum(len(part) - 1 for part in parts)))
+    return near.course is not None and theirs is not None and near.course.code_length > theirs.code_length + _FAR_WORSE_NATS
 
 
 def _estimate_sharp(stamps: Stamps, parts: list[NDArray[np.int64]], rate: float) -> RateEstimate | None:
