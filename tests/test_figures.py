@@ -134,7 +134,7 @@ def test_refusals(tmp_path):
     with pytest.raises(SchemaError, match="no variable"):
         save_figures(synthetic.surface(), tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="cannot be made"):
+    with pytest.raises(OutputError, match="is a file; give the name of a folder"):
         save_figures(synthetic.product(), tmp_path / "file")
 
 

@@ -93,7 +93,7 @@ def _prune(table, n):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _extend(new, kept, old, h, position, following, sigma, gain, hold):  # type: ignore[no-untyped-def]
+def _extend(new, kept, old, h, position, following, sigma, gain, hold, most):  # type: ignore[no-untyped-def]
     """Add to a table what hypothesis h becomes with a row that lies at `position`, and the next at `following`; the new length."""
     level, phase, cost = old[h, 0], old[h, 1], old[h, 2]
     weight = 0.5 / sigma**2
@@ -104,7 +104,7 @@ def _extend(new, kept, old, h, position, following, sigma, gain, hold):  # type:
     off = position - level - phase
     step = gain * off if weight * off * off < _OUTLIER_NATS else 0.0
     kept = _keep(new, kept, level, phase + step, cost + _stamp_nats(off, weight), h)
-    low, far = np.rint(off - _REACH_SIGMA * sigma), np.rint(off + _REACH_SIGMA * sigma)
+    low, far = np.rint(off - _REACH_SIGMA * sigma), min(np.rint(off + _REACH_SIGMA * sigma), most)
     while far >= low:  # a loss whose end this row may be, or a row too many
         if far > 0.0 or (far < 0.0 and far == np.rint(off)):
             rest = off - far
@@ -112,26 +112,27 @@ def _extend(new, kept, old, h, position, following, sigma, gain, hold):  # type:
             kept = _keep(new, kept, level + far, phase + gain * rest, dear, h)
         far -= 1.0
     ahead = np.rint(following - level - phase)
-    if ahead >= 1.0 and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5:  # a loss of which the next row shows the end
+    if 1.0 <= ahead <= most and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5:  # a loss of which the next row shows the end
         dear = cost + _switch_nats(ahead) + _stamp_nats(off - ahead, weight)
         kept = _keep(new, kept, level + ahead, phase, dear, h)
     return kept
 
 
 @njit(**INNER)
-def _seed(table, level, phase, first):  # type: ignore[no-untyped-def]
+def _seed(table, level, phase, first, most):  # type: ignore[no-untyped-def]
     """Begin with a hypothesis; where the first row of a piece is at `first`, samples may be lost between the first rows."""
     table[0, 0], table[0, 1], table[0, 2] = level, phase, 0.0
     size = np.int64(1)
     if not np.isnan(first):
         for lost in range(1, 1 + _EARLY_LOSSES):
             size = _keep(table, size, level - lost, phase, 0.0, np.int64(0))
-        size = _keep(table, size, np.rint(first - phase), phase, _LOSS_NATS, np.int64(0))  # or many, just after the first
+        if np.rint(first - phase) <= most:
+            size = _keep(table, size, np.rint(first - phase), phase, _LOSS_NATS, np.int64(0))  # or many, just after the first
     return size
 
 
 @njit(**KERNEL)
-def trace(count, stamps, count0, stamp0, period, sigma, gain, hold, level0, phase0, seen, levels, phases):  # type: ignore[no-untyped-def]
+def trace(count, stamps, count0, stamp0, period, sigma, gain, hold, most, level0, phase0, seen, levels, phases):  # type: ignore[no-untyped-def]
     """Find the most likely course of the stamps of rows.
 
     Parameters
@@ -148,6 +149,8 @@ def trace(count, stamps, count0, stamp0, period, sigma, gain, hold, level0, phas
         Share of a deviation that the phase takes over: it averages the jitter of the last ``1 / gain`` rows.
     hold : float
         A phase further from zero than this is turned into a sample left out, or a row dropped [samples].
+    most : float
+        Samples that may be lost at one time: damaged stamps far ahead are outliers, and not the end of a loss.
     level0, phase0 : int, float
         Samples lost so far, and phase of the clock [samples].
     seen : int
@@ -165,7 +168,7 @@ def trace(count, stamps, count0, stamp0, period, sigma, gain, hold, level0, phas
     parents = np.empty((n, _MOST), dtype=np.int8)
     table = np.empty((n, _MOST, 2))
     first = (stamps[0] - stamp0) / period - (count[0] - count0) if seen == 0 and n > 0 else np.nan
-    size = _seed(old, level0, phase0, first)
+    size = _seed(old, level0, phase0, first, most)
     for i in range(n):
         position = (stamps[i] - stamp0) / period - (count[i] - count0)
         after = min(i + 1, n - 1)
@@ -173,7 +176,7 @@ def trace(count, stamps, count0, stamp0, period, sigma, gain, hold, level0, phas
         follows = max(gain, 1.0 / (max(seen, _FIRST_ROWS) + i + 1.0))
         kept = np.int64(0)
         for h in range(size):
-            kept = _extend(new, kept, old, h, position, following, sigma, follows, hold)
+            kept = _extend(new, kept, old, h, position, following, sigma, follows, hold, most)
         size = _prune(new, kept) if kept > 1 else kept
         for h in range(size):
             table[i, h, 0], table[i, h, 1], parents[i, h] = new[h, 0], new[h, 1], np.int8(new[h, 3])
@@ -300,7 +303,7 @@ def follow(count, stamps, period, sigma, gain, longest, block):  # type: ignore[
         phase = find_phase(count[begin:end], stamps[begin:end], period, sigma)
         level = sample[begin:end]
         total += trace(
-            count[begin:end], stamps[begin:end], count[begin], stamps[begin], period, sigma, gain, np.inf,
+            count[begin:end], stamps[begin:end], count[begin], stamps[begin], period, sigma, gain, np.inf, longest / period,
             np.int64(0), phase, np.int64(0), level, off[begin:end],
         )  # fmt: skip
         for i in range(begin, end):

@@ -297,7 +297,7 @@ class _Placer:
         if len(at):
             trace(
                 count[at], stamps[at], self.count0, self.origin, self.period, self.sigma, _GAIN, self.hold,
-                self.level, self.phase, self.seen, levels, phases,
+                self.max_gap_ns / self.period, self.level, self.phase, self.seen, levels, phases,
             )  # fmt: skip
         if begins:
             self._anchor(int(levels[0]))

@@ -86,8 +86,8 @@ def _decoded(header: Header) -> xr.Dataset:
 def _lazy(stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int) -> xr.Dataset:
     """Load what is small, and make dask arrays, by the chunks on disk, of what is not one yet: making and reading one takes its time."""
     rest = {name: stored.variables[name] for name in stored.data_vars if name not in long}
-    ready = {
-        name: item.load() if item.size < small else item.chunk(item.encoding.get("preferred_chunks") or "auto")
+    ready = {  # text is always small, and dask cannot tell the size of its chunks
+        name: item.load() if item.size < small or item.dtype.kind in "OSU" else item.chunk(item.encoding.get("preferred_chunks") or "auto")
         for name, item in rest.items()
     }
     coords = xr.Coordinates({name: stored.variables[name] for name in stored.coords}, indexes={})

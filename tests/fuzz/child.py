@@ -39,7 +39,7 @@ def own_fault(error: BaseException | None, package: str) -> str:
         if (
             isinstance(error, DamageError)
             and cause is not None
-            and not isinstance(cause, MemoryError | ChunkDamage)
+            and not isinstance(cause, MemoryError | SystemError | ChunkDamage)  # a SystemError comes out of compiled code
             and innermost_is_ours(cause, package)
         ):
             last = traceback.extract_tb(cause.__traceback__)[-1]
