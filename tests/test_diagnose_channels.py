@@ -89,6 +89,28 @@ def test_slow_channels_and_vibration_keep_their_stamps(name: str, period: float)
     assert (aligned.unused, aligned.notes) == ({}, [])
 
 
+@pytest.mark.parametrize("period", [0.001, 0.01, 0.03])
+def test_channels_that_turn_with_the_tool_keep_their_stamps_beside_its_rotation(period: float):
+    """Gravity is then a wave at the rotation, coherent with any line there; a toolface wraps and has no mean."""
+    seconds = np.arange(0.0, 30.0, period)
+    accel = with_channel(log_of(), "accel_x", seconds, np.sin(2 * np.pi * seconds), "g")
+    turning = with_channel(accel, "rotation_rate", seconds, np.full(seconds.size, 360.0), "degree s-1")
+    assert align_channels(turning).log.identical(turning)
+    assert align_channels(accel).log["accel_x"].dims == ("time",)
+    toolface = with_channel(log_of(), "toolface", seconds, np.mod(360.0 * seconds, 360.0), "degree")
+    assert align_channels(toolface).log.identical(toolface)
+    ground = with_channel(turning, "seismometer_z", seconds, seconds)
+    assert align_channels(ground).log["seismometer_z"].dims == ("time",)
+
+
+def test_a_fast_toolface_is_not_called_too_slow():
+    seconds = np.arange(0.0, 600.0, 0.01)
+    reduced, _, _ = candidates_of(with_channel(log_of(60_000), "toolface", seconds, np.mod(70.0 * seconds, 360.0), "degree"))
+    assert [one["reason"] for one in unused_channels(reduced, ())] == [
+        "no effect follows a channel of this name; lines at the rotation are found with the channel rotation_rate"
+    ]
+
+
 @pytest.mark.parametrize(
     ("name", "seconds", "reason"),
     [

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.reduction.aligned import TURNING
 from gyrostab.physics.registry import effects
 
 __all__ = ["CALIBRATION_CHANNELS", "MIN_BLOCK_SHARE", "missing_channel_reason", "unused_channels"]
@@ -99,5 +100,7 @@ def _is_compared(name: str, reduced: xr.Dataset) -> bool:
 def _stranger(name: str, reduced: xr.Dataset) -> str:
     if _is_compared(name, reduced) or _wanted_units(name):
         return "no effect that this record can show follows it"
+    if name.startswith(TURNING):
+        return "no effect follows a channel of this name; lines at the rotation are found with the channel rotation_rate"
     rate = float(reduced.attrs["sampling_rate_hz"])
     return f"no effect follows a channel of this name, and it is too slow to be compared with the gyro sample by sample ({rate:.4g} Hz)"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.timegrid import TimeGridIndex, first_stamp, grid_index, grid_times
 
-__all__ = ["Aligned", "align_channels"]
+__all__ = ["TURNING", "Aligned", "align_channels"]
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -34,6 +34,10 @@ MAX_NEAREST_PERIODS = 0.75
 #: Stamps are even when half of the intervals lie within this share of their median. Stamps of the
 #: arrival come in bursts instead: their mean is the period, without gaps of so many medians.
 EVEN_SHARE, GAP_MEDIANS = 0.1, 16.0
+#: Beginnings of the names of channels that hold the rotation of the tool as a wave: gravity and the
+#: Earth's field turn in their frame. Such a wave is coherent with any line of the gyro at the
+#: rotation, whatever causes the line, so that sample by sample it is no evidence for a cause.
+TURNING = ("rotation_rate", "toolface", "accel", "mag_")
 _STAMPS_INSPECTED = 2**20
 _PIECE_SAMPLES = 2**20
 
@@ -101,7 +105,10 @@ def align_channels(log: xr.Dataset) -> Aligned:
     A channel sampled like the gyro, or a faster ramp, gives each sample the value nearest to it. A faster
     channel gives it the mean of its values about it, and one up to four times slower a value on the
     straight line between its neighbours, but not across gaps. Slower channels, and vibration,
-    whose rms counts, keep their stamps: they enter by their means over blocks.
+    whose rms counts, keep their stamps: they enter by their means over blocks. So do accelerometers
+    and magnetometers where the log has the rotation rate: with it the lines at the rotation are
+    measured, and the wave of gravity would explain them once more. A toolface always keeps its
+    stamps, since angles that wrap have no mean.
 
     Parameters
     ----------
@@ -162,7 +169,7 @@ def _lay_channel(log: xr.Dataset, name: str) -> _Laid | str | None:
             f"it is sampled at {1e9 / period:.4g} Hz, slower than the gyro at {rate:.4g} Hz, "
             "so that its phase between its samples is not known"
         )
-    if name.startswith("vibration") or ratio > MAX_LINEAR_PERIODS:
+    if name.startswith("vibration") or ratio > MAX_LINEAR_PERIODS or _is_wave_of_rotation(log, name):
         return None
     held = log[name].attrs.get("interpolation") == "previous"
     choose: _Choose
@@ -174,6 +181,11 @@ def _lay_channel(log: xr.Dataset, name: str) -> _Laid | str | None:
         choose, reach, how = _at_mean, 1.0, f"each sample has the mean of its values at {1e9 / period:.4g} Hz"
     lay = partial(_lay_piece, clock, start=start, rate=rate, reach=max(reach * period, 0.5e9 / rate), choose=choose)
     return _Laid(_on_grid(log, name, clock, lay, size), _note(name, clock, start, rate, period, how))
+
+
+def _is_wave_of_rotation(log: xr.Dataset, name: str) -> bool:
+    """Return whether a channel only repeats, sample by sample, the rotation that another channel gives."""
+    return name == "toolface" or (name.startswith(TURNING) and "rotation_rate" in log.data_vars)
 
 
 def _clock_of(log: xr.Dataset, name: str) -> _Clock:
