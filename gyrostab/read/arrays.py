@@ -39,7 +39,8 @@ def to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
         return plain, words
     array = np.asarray(values)
     if array.dtype.kind in "biuf":
-        return array.astype(np.float64), 0
+        with np.errstate(invalid="ignore"):  # damaged bytes may be a signalling NaN
+            return array.astype(np.float64), 0
     out = np.full(array.shape, np.nan)
     words = 0
     for index, value in enumerate(array.ravel()):
