@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import TimeError
@@ -76,6 +76,7 @@ def test_jitter_at_random_in_every_way():
     @given(
         st.sampled_from(combinations), st.floats(0, 0.6), st.sampled_from(["ns", "us", "ms"]), st.floats(40, 400), st.integers(0, 2**32 - 1)
     )
+    @example(how=("latest", "none"), scatter=0.375, unit="ns", rate=40.0, seed=1)
     def check(how, scatter, unit, rate, seed):
         jitter, losses = how
         log, _, given, samples = place(jitter, scatter, losses, unit, rate=round(rate, 2), rows=6000, seed=seed)
@@ -83,6 +84,30 @@ def test_jitter_at_random_in_every_way():
         assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-3)
 
     check()
+
+
+@pytest.mark.parametrize(
+    ("jitter", "scatter", "rate", "unit", "seed"),
+    [
+        ("latest", 0.375, 40.0, "ns", 1),
+        ("uniform", 0.5, 400.0, "ms", 1635),
+    ],
+)
+def test_a_few_rows_that_share_a_stamp_are_samples_of_their_own(jitter, scatter, rate, unit, seed):
+    log, _, given, samples = place(jitter, scatter, "none", unit, rate=rate, rows=6000, seed=seed)
+    np.testing.assert_array_equal(given, samples)
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-6)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.04])
+def test_a_few_rows_that_share_a_stamp_are_the_same_sample_given_twice(share):
+    random = np.random.default_rng(5)
+    stamps = round_stamps(scatter_stamps(np.arange(6000), "uniform", 0.5, random), 40.0, "us")
+    rows = np.sort(np.append(np.arange(6000), np.flatnonzero(random.random(6000) < share)))
+    log = regularise(raw_log(stamps[rows], random.standard_normal(6000)[rows]))
+    assert np.isfinite(log.rate.values).all()
+    assert log.sizes["time"] - 6000 in (0, 1)  # no row follows that tells whether one of the last rows is given twice
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(40.0, rel=1e-6)
 
 
 @pytest.mark.parametrize("scatter", [0.1, 0.3, 0.5])
