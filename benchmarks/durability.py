@@ -114,7 +114,7 @@ def read_tree(folder: Path) -> dict[str, bytes]:
 
 def is_hidden(folder: Path, name: str) -> bool:
     """Whether what lies beside an output is a leftover or the folder of a run."""
-    from gyrostab.output import is_leftover
+    from gyrostab.store.output import is_leftover
 
     return is_leftover(name) or name.endswith(".job")
 

@@ -123,7 +123,7 @@ def read_own(files: list[Path], workers: int, repeat: int) -> tuple[float, float
     """Every chunk of every file as doubles, by gyrostab."""
     import dask
 
-    from gyrostab.export import open_log
+    from gyrostab.io.datasets import open_log
 
     def work() -> None:
         logs = [open_log(file) for file in files]

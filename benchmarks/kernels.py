@@ -38,7 +38,7 @@ from gyrostab.davar.plan import last_sample, units_of_work
 from gyrostab.kernels.integrate import present_runs
 from gyrostab.kernels.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.windows import averaging_factors, thin
+from gyrostab.time.durations import averaging_factors, thin
 
 RATE = 100.0
 SHAPES = {"x1": (6_000, 1000, 30), "x2": (600_000, 2000, 300), "vibration": (372_000, 2000, 1000)}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import gyrostab
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.timegrid import grid_times, time_coordinate
+from gyrostab.time.grid import grid_times, time_coordinate
 
 START = pd.Timestamp("2026-01-01").as_unit("ns").value
 WHITE = 180.0  # standard deviation of the white noise [counts]

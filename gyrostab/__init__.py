@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from gyrostab.diagnose.core import diagnose as diagnose
     from gyrostab.diagnosis_folder import open_diagnosis as open_diagnosis
     from gyrostab.diagnosis_folder import write_diagnosis as write_diagnosis
-    from gyrostab.export import open_log as open_log
-    from gyrostab.export import open_product as open_product
-    from gyrostab.export import open_surface as open_surface
-    from gyrostab.export import to_netcdf as to_netcdf
-    from gyrostab.export import to_zarr as to_zarr
     from gyrostab.fit import fit_noise as fit_noise
+    from gyrostab.io.datasets import open_log as open_log
+    from gyrostab.io.datasets import open_product as open_product
+    from gyrostab.io.datasets import open_surface as open_surface
+    from gyrostab.io.datasets import to_netcdf as to_netcdf
+    from gyrostab.io.datasets import to_zarr as to_zarr
     from gyrostab.kalibr import to_kalibr as to_kalibr
     from gyrostab.log import make_log as make_log
     from gyrostab.plot import plot_adev as plot_adev
@@ -67,9 +67,9 @@ _HOME = {
     "make_log": "log",
     "make_noise": "simulate",
     "open_diagnosis": "diagnosis_folder",
-    "open_log": "export",
-    "open_product": "export",
-    "open_surface": "export",
+    "open_log": "io.datasets",
+    "open_product": "io.datasets",
+    "open_surface": "io.datasets",
     "plot_adev": "plot",
     "plot_coefficients": "plot",
     "plot_correlation": "plot",
@@ -85,8 +85,8 @@ _HOME = {
     "scan": "scan",
     "simulate": "simulate",
     "to_kalibr": "kalibr",
-    "to_netcdf": "export",
-    "to_zarr": "export",
+    "to_netcdf": "io.datasets",
+    "to_zarr": "io.datasets",
     "write_diagnosis": "diagnosis_folder",
     "write_report": "report",
 }

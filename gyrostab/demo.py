@@ -138,10 +138,10 @@ def run_demo(folder: str | Path, *, overwrite: bool = False, stage: Stage = no_s
         When the folder cannot be written to, or holds one of the files and `overwrite` is not given.
     """
     from gyrostab.davar import davar
-    from gyrostab.export import to_netcdf
     from gyrostab.fit import fit_noise
-    from gyrostab.output import check_folder, new_folder, protect_inputs
+    from gyrostab.io.datasets import to_netcdf
     from gyrostab.report import write_report
+    from gyrostab.store.output import check_folder, new_folder, protect_inputs
 
     folder = Path(folder)
     with protect_inputs([sample_log()]):

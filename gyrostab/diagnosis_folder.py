@@ -11,10 +11,10 @@ import xarray as xr
 
 from gyrostab.diagnose.conclusion.result import Diagnosis, check_diagnosis, model_text
 from gyrostab.errors import FormatError, SchemaError
-from gyrostab.export import open_dataset, to_netcdf
-from gyrostab.output import new_output
-from gyrostab.output.content import read_json
+from gyrostab.io.datasets import open_dataset, to_netcdf
 from gyrostab.report import write_diagnosis_report
+from gyrostab.store.output import new_output
+from gyrostab.store.output.content import read_json
 
 __all__ = ["FILES", "find_foreign_file", "open_diagnosis", "write_diagnosis"]
 

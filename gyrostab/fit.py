@@ -19,7 +19,7 @@ from gyrostab.kernels.limits import cell_limits, interpolate_quantile
 from gyrostab.kernels.pairs import white_pair_sum
 from gyrostab.noise import LAWS, TERMS, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_surface
-from gyrostab.windows import duration_seconds, thin
+from gyrostab.time.durations import duration_seconds, thin
 
 __all__ = ["fit_noise", "fit_part", "is_described", "refit"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.timegrid import grid_index, grid_times
+from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = [
     "CAUSE",

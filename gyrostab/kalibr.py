@@ -29,8 +29,8 @@ import xarray as xr
 
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
-from gyrostab.output import new_output
 from gyrostab.schema import texts
+from gyrostab.store.output import new_output
 from gyrostab.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
 
 __all__ = ["KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]

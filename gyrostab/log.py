@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.errors import OptionError
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.timegrid import check_rate, check_span, stamp_ns, time_coordinate
+from gyrostab.time.grid import check_rate, check_span, stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
 
 __all__ = ["make_log"]

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.gaps import gap_variables
-from gyrostab.timegrid import grid_times, time_coordinate
+from gyrostab.time.grid import grid_times, time_coordinate
 
 RATE = 50.0
 START = int(np.datetime64("2026-03-01T10:00:00", "ns").astype(np.int64))

@@ -10,8 +10,8 @@ import netCDF4
 import numpy as np
 import xarray as xr
 
-from gyrostab.export import to_netcdf, to_zarr
-from gyrostab.timegrid import time_coordinate
+from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.time.grid import time_coordinate
 
 WRITERS = {"nc": to_netcdf, "zarr": to_zarr}
 RATE = 100.0

@@ -9,7 +9,7 @@ import xarray as xr
 
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import attributes
-from gyrostab.timegrid import grid_times, time_coordinate
+from gyrostab.time.grid import grid_times, time_coordinate
 
 START = 1_790_000_000_123_456_789  # September 2026, with odd nanoseconds
 RATE = 300.0

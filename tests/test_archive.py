@@ -13,14 +13,14 @@ import xarray as xr
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gyrostab import export
 from gyrostab.errors import OptionError, TimeError, UnitError
+from gyrostab.io import datasets as export
 from gyrostab.join import join_logs
 from gyrostab.join.grid import runs_of
 from gyrostab.read import read_log
 from gyrostab.regularise import gap_table, regularise
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.timegrid import TimeGridIndex, grid_times
+from gyrostab.time.grid import TimeGridIndex, grid_times
 from tests.regular_logs import RATE, SIZE, START, cut, log_of, nan_runs, rechunked, said, signal
 
 

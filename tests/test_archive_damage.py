@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyrostab import export
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, MissingUnitError, OptionError
+from gyrostab.io import datasets as export
 from gyrostab.read import read_log
 from gyrostab.regularise import gap_table, regularise
 from gyrostab.run import load_log

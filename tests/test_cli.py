@@ -19,7 +19,7 @@ import xarray as xr
 
 from gyrostab.__main__ import main as start
 from gyrostab.cli import app
-from gyrostab.export import open_log, open_product, open_surface, to_netcdf
+from gyrostab.io.datasets import open_log, open_product, open_surface, to_netcdf
 from gyrostab.log import make_log
 from tests.command_line import N_TRUE, WINDOW, call, stopped, write_log
 

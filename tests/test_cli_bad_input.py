@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.errors import OutputError
-from gyrostab.export import open_log, open_product, to_netcdf
+from gyrostab.io.datasets import open_log, open_product, to_netcdf
 from gyrostab.read.buffers import Buffers
 from gyrostab.run import load_log
 from tests.command_line import RATE, WINDOW, call, stopped, write_log

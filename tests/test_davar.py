@@ -21,7 +21,7 @@ from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.log import make_log
 from gyrostab.schema import ESTIMATORS
 from gyrostab.store.direct import held
-from gyrostab.windows import thin
+from gyrostab.time.durations import thin
 from tests.reference import direct_angle_surface, direct_surface
 
 STRICT, WEIGHTED = ESTIMATORS.index("strict_runs"), ESTIMATORS.index("weighted_clusters")

@@ -10,7 +10,7 @@ from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places, 
 from gyrostab.kernels.surface import Unit, surface_unit
 from gyrostab.kernels.vectors import IN_A_ROW, LANES, split_sums
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.windows import thin
+from gyrostab.time.durations import thin
 
 
 class TestKernels:

@@ -18,7 +18,7 @@ import xarray as xr
 from gyrostab.cli import main
 from gyrostab.demo import FILES, find_parts, sample_log
 from gyrostab.errors import SchemaError
-from gyrostab.export import open_log, open_product
+from gyrostab.io.datasets import open_log, open_product
 
 pytestmark = pytest.mark.xdist_group("demo")  # one worker, one run of the demo
 

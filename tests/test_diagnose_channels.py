@@ -20,7 +20,7 @@ from gyrostab.diagnose.effects.channel_use import unused_channels
 from gyrostab.diagnose.reduction.aligned import align_channels
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.log import make_log
-from gyrostab.timegrid import time_coordinate
+from gyrostab.time.grid import time_coordinate
 
 RATE, SIZE = 100.0, 3000
 START = np.datetime64("2026-03-14T08:00:00", "ns")

@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab import make_log, open_product, to_netcdf, to_zarr
-from gyrostab.export import open_log
 from gyrostab.fit import fit_noise, fit_part
+from gyrostab.io.datasets import open_log
 from gyrostab.join import join_logs
 from gyrostab.join.lazy import lay
-from gyrostab.parts import read_part, transposed, with_part
 from gyrostab.read.buffers import lazily
 from gyrostab.read.pieces import Spool
 from gyrostab.regularise import fill
@@ -26,6 +25,7 @@ from gyrostab.run import checkpoint, load_log, run
 from gyrostab.store import deflate, header, read, write
 from gyrostab.store.direct import can_fill, end_to_end, fill_row, held, one_row, stack_rows, stretch
 from gyrostab.store.header import read_header
+from gyrostab.store.parts import read_part, transposed, with_part
 
 WINDOW = {"window": "40s", "step": "10s", "taus": "8"}
 

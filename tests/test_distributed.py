@@ -21,7 +21,7 @@ from gyrostab import make_log, to_netcdf, to_zarr
 from gyrostab.cli import main
 from gyrostab.davar import davar_parts
 from gyrostab.errors import OptionError, WorkerError
-from gyrostab.export import open_log
+from gyrostab.io.datasets import open_log
 from gyrostab.run import checkpoint, engine, run
 from gyrostab.run.schedule import Pool, check_scheduler, in_any_order, open_pool
 

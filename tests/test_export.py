@@ -22,13 +22,13 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gyrostab import export
 from gyrostab.errors import FormatError, OptionError, SchemaError
-from gyrostab.export import open_dataset, open_log, open_product, open_surface, to_netcdf, to_zarr
+from gyrostab.io import datasets as export
+from gyrostab.io.datasets import open_dataset, open_log, open_product, open_surface, to_netcdf, to_zarr
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
 from gyrostab.store import deflate
-from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
+from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import INNER
 from tests import synthetic
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from gyrostab.cli import main
 from gyrostab.errors import OutputError, SchemaError
-from gyrostab.export import to_netcdf
+from gyrostab.io.datasets import to_netcdf
 from gyrostab.noise import LAWS
 from gyrostab.plot import plot_coefficients, plot_davar, plot_signal
 from gyrostab.plot.figures import product_figures, save_figures

@@ -15,7 +15,7 @@ import gyrostab
 from gyrostab.convert import as_log
 from gyrostab.errors import GyrostabError, MissingUnitError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.log import make_log
-from gyrostab.timegrid import TimeGridIndex
+from gyrostab.time.grid import TimeGridIndex
 from tests.reference import direct_angle_surface, direct_surface
 from tests.regular_logs import log_of, signal
 

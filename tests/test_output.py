@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from gyrostab.errors import OutputError
-from gyrostab.export import open_surface, to_netcdf, to_zarr
-from gyrostab.output import find_foreign_item, new_output
+from gyrostab.io.datasets import open_surface, to_netcdf, to_zarr
+from gyrostab.store.output import find_foreign_item, new_output
 from tests import synthetic
 
 
@@ -34,7 +34,7 @@ import resource, sys
 sys.path.insert(0, {tests!r})
 from tests import synthetic
 from gyrostab.errors import OutputError
-from gyrostab.export import to_netcdf
+from gyrostab.io.datasets import to_netcdf
 log = synthetic.log(samples=300_000)
 log = log.chunk(time=50_000) if {lazy} else log
 resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
@@ -107,7 +107,7 @@ def test_a_late_piece_of_a_directory_is_removed_too(tmp_path, monkeypatch):
         looks.append(seconds)
 
     looks: list[float] = []
-    monkeypatch.setattr("gyrostab.output.write.time.sleep", write_on)
+    monkeypatch.setattr("gyrostab.store.output.write.time.sleep", write_on)
     with pytest.raises(ZeroDivisionError), new_output(tmp_path / "out.zarr", find_foreign=find_foreign_item) as folder:
         raise ZeroDivisionError
     assert not late

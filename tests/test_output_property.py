@@ -18,9 +18,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from gyrostab import davar, fit_noise, open_log, to_netcdf, to_zarr
-from gyrostab.export import open_dataset
-from gyrostab.output import is_leftover
-from gyrostab.output import write as writing
+from gyrostab.io.datasets import open_dataset
+from gyrostab.store.output import is_leftover
+from gyrostab.store.output import write as writing
 
 from .command_line import call, write_log
 

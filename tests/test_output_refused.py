@@ -12,9 +12,9 @@ import xarray as xr
 
 from gyrostab import davar, fit_noise, make_log, open_log, to_netcdf, to_zarr
 from gyrostab.errors import GyrostabError, OptionError, OutputError
-from gyrostab.output import check_output, find_foreign_item, new_folder, new_output, protect_inputs
 from gyrostab.run import run
 from gyrostab.run.job import folder_of
+from gyrostab.store.output import check_output, find_foreign_item, new_folder, new_output, protect_inputs
 
 from .command_line import WINDOW, call, write_log
 
@@ -324,7 +324,7 @@ def test_what_another_process_has_made_meanwhile_is_not_replaced(tmp_path, suffi
 def test_a_folder_is_replaced_in_one_step_or_put_back(tmp_path, monkeypatch, renameat2):
     log = make_log(np.zeros((1, 10)), rate=1.0, unit="deg/h")
     if not renameat2:
-        monkeypatch.setattr("gyrostab.output.write._rename", lambda *_: False)
+        monkeypatch.setattr("gyrostab.store.output.write._rename", lambda *_: False)
     path = to_zarr(log, tmp_path / "log.zarr")
     to_zarr(log.isel(time=slice(0, 5)), path, overwrite=True)
     assert open_log(path).sizes["time"] == 5
@@ -346,7 +346,7 @@ def test_a_folder_is_replaced_in_one_step_or_put_back(tmp_path, monkeypatch, ren
 
 @pytest.mark.parametrize("change", ["has changed", "has vanished"])
 def test_an_input_that_changes_before_the_output_is_complete(folder, change, monkeypatch, capfd):
-    from gyrostab import export
+    from gyrostab.io import datasets as export
 
     begin = export._begin_netcdf
 

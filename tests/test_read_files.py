@@ -15,7 +15,7 @@ import gyrostab.read.files as files
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.read import FileSummary, ReadOptions, read_log, readers, scan_file
 from gyrostab.schema import check_log, check_raw
-from gyrostab.timegrid import TimeGridIndex, time_coordinate
+from gyrostab.time.grid import TimeGridIndex, time_coordinate
 
 HEADER = "time [s],gyro_x [deg/h],gyro_y [deg/h],temperature [degC]\n"
 
@@ -261,7 +261,7 @@ def test_channels_of_a_zarr_store_come_in_the_order_of_their_names(tmp_path: Pat
 
 @pytest.mark.parametrize("name", ["log.nc", "log.zarr"])
 def test_what_export_writes_is_read(tmp_path: Path, name: str) -> None:
-    from gyrostab import export
+    from gyrostab.io import datasets as export
 
     log = regular_log()
     log["vibration"].attrs["units"] = "g"

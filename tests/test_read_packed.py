@@ -17,7 +17,7 @@ from gyrostab.kernels.stamps import NO_STAMP, new_state, place
 from gyrostab.read import buffers, files, read_log, text
 from gyrostab.read.combine import memory
 from gyrostab.read.pieces import Counts, Pieces, Spool, Steps, Words
-from gyrostab.threads import in_order
+from gyrostab.store.threads import in_order
 
 
 def bits(values: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from pyarrow import parquet
 from gyrostab.errors import FormatError, OptionError, UnitError
 from gyrostab.read import read_log, scan_file
 from gyrostab.read.stamps import NAT, dates_to_ns, integers_to_ns, parse_time_unit
-from gyrostab.timegrid import stamp_ns
+from gyrostab.time.grid import stamp_ns
 
 ROWS = 40
 

@@ -11,7 +11,7 @@ from gyrostab.errors import TimeError
 from gyrostab.regularise import gap_table, regularise
 from gyrostab.regularise.place import place_by_stamp
 from gyrostab.regularise.rate import estimate_rate
-from gyrostab.timegrid import time_coordinate
+from gyrostab.time.grid import time_coordinate
 
 from .raw_rows import START, expected, raw_log, stamps_of
 

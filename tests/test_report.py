@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gyrostab.errors import OutputError, SchemaError
-from gyrostab.export import open_log, open_product, to_netcdf
+from gyrostab.io.datasets import open_log, open_product, to_netcdf
 from gyrostab.report import write_report
 from tests import synthetic
 

@@ -18,10 +18,10 @@ import xarray as xr
 from gyrostab import davar, fit_noise, make_log, open_product, to_netcdf
 from gyrostab.cli import main
 from gyrostab.davar import davar_part, davar_parts
-from gyrostab.export import open_log
+from gyrostab.io.datasets import open_log
 from gyrostab.run import checkpoint, engine
 from gyrostab.run.job import folder_of, hold
-from gyrostab.timegrid import time_coordinate
+from gyrostab.time.grid import time_coordinate
 from tests.crashing import WINDOW
 
 pytestmark = pytest.mark.xdist_group("resume")

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from gyrostab.davar import davar
 from gyrostab.errors import SchemaError
-from gyrostab.export import open_log, to_netcdf
+from gyrostab.io.datasets import open_log, to_netcdf
 from gyrostab.log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.regularise import gap_table

@@ -10,7 +10,7 @@ import pytest
 
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, SchemaError
-from gyrostab.export import open_log
+from gyrostab.io.datasets import open_log
 from gyrostab.regularise import gap_table
 from gyrostab.schema import check_log
 from gyrostab.simulate import read_model, simulate

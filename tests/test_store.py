@@ -14,10 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, SchemaError, TimeError
-from gyrostab.export import open_log, to_netcdf, to_zarr
+from gyrostab.io.datasets import open_log, to_netcdf, to_zarr
 from gyrostab.kernels.counts import from_counts, to_counts
 from gyrostab.store import chunk_samples
-from gyrostab.timegrid import TimeGridIndex, grid_times
+from gyrostab.time.grid import TimeGridIndex, grid_times
 from tests import synthetic
 
 from .stored import CHUNK, FACTOR, RATE, START, WRITERS, counts_log, same_bits, stored_kinds

@@ -17,10 +17,10 @@ import gyrostab
 import gyrostab.store.layout as layout_module
 import gyrostab.store.read as read_module
 from gyrostab.errors import DamageError, FormatError
-from gyrostab.export import open_log, open_product, to_netcdf, to_zarr
+from gyrostab.io.datasets import open_log, open_product, to_netcdf, to_zarr
 from gyrostab.store.direct import fill_row
 from gyrostab.store.kept import KeptChunks
-from gyrostab.timegrid import time_coordinate
+from gyrostab.time.grid import time_coordinate
 
 from . import synthetic
 from .stored import CHUNK, START, WRITERS, counts_log, same_bits, spoil

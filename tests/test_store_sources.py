@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.export import open_log, to_netcdf
+from gyrostab.io.datasets import open_log, to_netcdf
 
 from .stored import WRITERS, same_bits, stored_kinds
 

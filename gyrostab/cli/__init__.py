@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from gyrostab.cli import commands
 from gyrostab.cli.console import complain, explain, plain_notes, read_config, seldom_collected, stoppable
 from gyrostab.cli.frame import app, find_inputs
-from gyrostab.output import protect_inputs
+from gyrostab.store.output import protect_inputs
 
 __all__ = ["app", "main"]
 

@@ -21,7 +21,7 @@ from gyrostab.concealed.telemetry import SHORTEST
 from gyrostab.concealed.visible import is_buried
 from gyrostab.concealed.world import AXES, Effect, World, draw_world, stream
 from gyrostab.errors import OptionError
-from gyrostab.timegrid import grid_times
+from gyrostab.time.grid import grid_times
 
 __all__ = ["BLOCK", "draw_effects", "make_case", "truth_of"]
 

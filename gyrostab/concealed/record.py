@@ -15,7 +15,7 @@ from gyrostab.concealed.environment import sense
 from gyrostab.concealed.world import AXES, QUICK, Effect, World, stream, to_samples
 from gyrostab.gaps import gap_variables
 from gyrostab.schema import check_log
-from gyrostab.timegrid import time_coordinate
+from gyrostab.time.grid import time_coordinate
 
 __all__ = ["base_noise", "channels_of", "gap_columns", "lost", "make_log", "signal", "with_channels"]
 

@@ -18,7 +18,7 @@ from gyrostab.concealed.record import channels_of, gap_columns, with_channels
 from gyrostab.concealed.world import Effect, World, draw_world, to_samples
 from gyrostab.errors import OptionError
 from gyrostab.schema import check_log, signal_name
-from gyrostab.timegrid import first_stamp
+from gyrostab.time.grid import first_stamp
 
 __all__ = ["counts_of", "rough_noise", "salt"]
 

@@ -30,7 +30,7 @@ from gyrostab.kernels.coupling import (
 )
 from gyrostab.noise import TERMS
 from gyrostab.schema import OBSERVABLE, check_product
-from gyrostab.windows import duration_seconds
+from gyrostab.time.durations import duration_seconds
 
 __all__ = ["correlate"]
 

@@ -15,7 +15,7 @@ from gyrostab.kernels.trend import window_trend
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels
 from gyrostab.store.direct import stretch
-from gyrostab.timegrid import first_stamp, grid_times
+from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER
 
 __all__ = ["window_channels"]

@@ -26,10 +26,10 @@ from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_th
 from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, avar_columns, sample_squares
-from gyrostab.output import pass_sources
 from gyrostab.schema import attributes
 from gyrostab.store.direct import can_fill, fill_row, stretch
-from gyrostab.timegrid import first_stamp, grid_times
+from gyrostab.store.output import pass_sources
+from gyrostab.time.grid import first_stamp, grid_times
 
 __all__ = ["davar", "davar_part", "davar_parts"]
 

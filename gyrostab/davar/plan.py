@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab.errors import OptionError
 from gyrostab.kernels.surface import Unit
 from gyrostab.schema import signal_name
-from gyrostab.windows import averaging_factors, samples, thin
+from gyrostab.time.durations import averaging_factors, samples, thin
 
 __all__ = ["MOST_CELLS", "WINDOWS_S", "Plan", "choose_window", "last_sample", "make_plan", "units_of_work"]
 

@@ -31,8 +31,8 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 from gyrostab.simulate.model import Model, read_model
-from gyrostab.timegrid import first_stamp
-from gyrostab.windows import duration_seconds
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import first_stamp
 
 __all__ = ["diagnose", "quiet_span"]
 

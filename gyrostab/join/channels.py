@@ -16,7 +16,7 @@ from gyrostab.join.grid import Piece
 from gyrostab.join.lazy import Part, fill_parts, lay
 from gyrostab.schema import log_channels
 from gyrostab.store.direct import can_fill, with_fill
-from gyrostab.timegrid import grid_index, grid_times
+from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["join_channels"]
 

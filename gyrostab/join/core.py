@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.clock import time_of_day
 from gyrostab.errors import TimeError, UnitError
 from gyrostab.gaps import gap_variables, name_lost, stamp_text
 from gyrostab.join.axes import group_axes
@@ -23,8 +22,9 @@ from gyrostab.join.place import place_logs
 from gyrostab.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
 from gyrostab.store import common_packing
-from gyrostab.timegrid import grid_times, time_coordinate
-from gyrostab.windows import duration_seconds
+from gyrostab.time.clock import time_of_day
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import grid_times, time_coordinate
 
 __all__ = ["join_logs", "log_span"]
 

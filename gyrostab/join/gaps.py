@@ -12,7 +12,7 @@ from gyrostab.gaps import CAUSE, END, FIRST, clip_table, thinned
 from gyrostab.join.axes import group_axes
 from gyrostab.join.grid import Piece
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.timegrid import grid_index
+from gyrostab.time.grid import grid_index
 
 __all__ = ["join_gaps"]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gyrostab.schema import signal_name
 from gyrostab.store.direct import stretch
-from gyrostab.timegrid import TimeGridIndex, first_stamp, grid_times
+from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_times
 
 __all__ = ["Piece", "Source", "Stretch", "log_span", "read_stretches", "runs_of", "source_of"]
 

@@ -18,7 +18,7 @@ from gyrostab.gaps import duration, stamp_text
 from gyrostab.join.grid import Piece, Source, Stretch, read_stretches, runs_of
 from gyrostab.join.notes import first_few, some
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.timegrid import grid_index, grid_times
+from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["place_logs"]
 

@@ -16,7 +16,7 @@ from gyrostab.plot.signal import thin
 from gyrostab.plot.style import COLOURS, GREY, label_log_axis, literal_text, new_figure, unit_label
 from gyrostab.plot.surface import CHANGE_CMAP
 from gyrostab.schema import signal_name
-from gyrostab.windows import duration_seconds
+from gyrostab.time.durations import duration_seconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import xarray as xr
 
 from gyrostab.correlate import correlate
-from gyrostab.output import check_folder, new_folder
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
 from gyrostab.plot.correlation import plot_correlation
 from gyrostab.plot.style import save_png
 from gyrostab.plot.surface import plot_davar, plot_davar_3d
 from gyrostab.schema import check_product
+from gyrostab.store.output import check_folder, new_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

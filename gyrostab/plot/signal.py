@@ -51,7 +51,7 @@ def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[
 
     Examples
     --------
-    >>> from gyrostab.timegrid import time_coordinate
+    >>> from gyrostab.time.grid import time_coordinate
     >>> values = np.zeros((1, 100)) + 7.0
     >>> log = xr.Dataset({"rate": (("axis", "time"), values, {"units": "degree hour-1"})}, coords={"axis": ["x"]})
     >>> plot_signal(log.assign_coords(time_coordinate(0, 100.0, 100))).axes[0].get_ylabel()

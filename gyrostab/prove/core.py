@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gyrostab.errors import ResumeError
-from gyrostab.output import resolve_link
 from gyrostab.prove.folder import TUNING, begin, case_name, look, read_sums, write_sums
 from gyrostab.prove.pool import each_in_processes
 from gyrostab.prove.steps import compare_case, diagnose_case, draw_case
+from gyrostab.store.output import resolve_link
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
-from gyrostab.output import is_leftover, replace_file
-from gyrostab.output.check import check_target
-from gyrostab.output.content import read_json
 from gyrostab.run.job import is_lock
+from gyrostab.store.output import is_leftover, replace_file
+from gyrostab.store.output.check import check_target
+from gyrostab.store.output.content import read_json
 
 __all__ = ["TUNING", "asked", "begin", "case_name", "code_state", "look", "read_sums", "write_json", "write_sums", "write_text"]
 

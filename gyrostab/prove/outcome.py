@@ -11,9 +11,9 @@ from typing import Any
 import pandas as pd
 
 from gyrostab.concealed import by_effect, curves, markdown, missed, reliability, salt_differences, salt_table, score_case
-from gyrostab.output import replace_file
 from gyrostab.prove.figures import draw_completeness, draw_reliability
 from gyrostab.prove.folder import TUNING, write_text
+from gyrostab.store.output import replace_file
 
 __all__ = ["page_text", "score_rows", "write_outcome"]
 

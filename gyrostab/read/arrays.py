@@ -17,7 +17,7 @@ from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.pieces import Steps, Stored
 from gyrostab.read.stamps import NAT, cells_to_ns, dates_to_ns, floats_to_ns, integers_to_ns, looks_iso, signed_counts
 from gyrostab.store.seen import look_at_cells
-from gyrostab.threads import in_order
+from gyrostab.store.threads import in_order
 
 __all__ = ["Fetch", "batch_rows", "convert_batch", "holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
 

@@ -20,7 +20,7 @@ from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.optional import library
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.tables import Part, Table, plain_names, read_tables, scan_tables
-from gyrostab.timegrid import grid_times
+from gyrostab.time.grid import grid_times
 
 __all__ = ["matches", "read", "scan"]
 

@@ -19,7 +19,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.cf import from_disk
 from gyrostab.errors import FormatError, SchemaError, TimeError, reading_of
 from gyrostab.limits import check_stored
 from gyrostab.read.arrays import float32_note, read_columns, summarise
@@ -32,8 +31,9 @@ from gyrostab.read.stamps import names_epoch
 from gyrostab.read.variables import StoredVariable, open_variables, with_default_fill
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store import name_file, open_stored, stored_attribute
+from gyrostab.store.cf import from_disk
 from gyrostab.store.rows import LibraryRows, Rows
-from gyrostab.timegrid import grid_times, time_coordinate
+from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.uniform import as_uniform
 from gyrostab.units import ON_DISK
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.limits import check_limits
-from gyrostab.timegrid import check_rate, stamp_ns
+from gyrostab.time.grid import check_rate, stamp_ns
 
 __all__ = ["ColumnSummary", "FileSummary", "ReadOptions"]
 

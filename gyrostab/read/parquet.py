@@ -16,7 +16,7 @@ from gyrostab.read.buffers import SPILL_BYTES
 from gyrostab.read.columns import Plan, plan_columns
 from gyrostab.read.intake import Intake, Taken
 from gyrostab.read.options import FileSummary, ReadOptions
-from gyrostab.threads import in_order
+from gyrostab.store.threads import in_order
 
 __all__ = ["matches", "read", "scan"]
 

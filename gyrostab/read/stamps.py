@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
-from gyrostab.timegrid import split_instant
+from gyrostab.time.grid import split_instant
 
 __all__ = [
     "NAT",

@@ -29,7 +29,7 @@ from gyrostab.read.intake import Intake, Taken, summary_of
 from gyrostab.read.layout import BLANK, Layout, find_layout, is_number, is_text, split_line, unit_of_duration
 from gyrostab.read.options import FileSummary, ReadOptions
 from gyrostab.read.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
-from gyrostab.threads import in_order
+from gyrostab.store.threads import in_order
 
 __all__ = ["matches", "read", "read_head", "scan"]
 

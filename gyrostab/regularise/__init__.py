@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from gyrostab.clock import time_of_day
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.gaps import gap_variables, name_lost
 from gyrostab.limits import check_limits
@@ -29,9 +28,10 @@ from gyrostab.regularise.survey import BLOCK, Survey, blocks, file_of, survey
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
 from gyrostab.store import chunk_samples
 from gyrostab.store.direct import stretch
-from gyrostab.timegrid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
+from gyrostab.time.clock import time_of_day
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
 from gyrostab.uniform import as_uniform
-from gyrostab.windows import duration_seconds
 
 __all__ = ["gap_table", "regularise"]
 

@@ -8,7 +8,7 @@ import xarray as xr
 
 from gyrostab.join import join_logs, some, split_axes
 from gyrostab.schema import texts
-from gyrostab.timegrid import first_stamp
+from gyrostab.time.grid import first_stamp
 
 __all__ = ["regularise_axes"]
 

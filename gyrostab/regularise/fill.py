@@ -14,8 +14,8 @@ from gyrostab.kernels.stamps import NO_STAMP, RESTART, STEP
 from gyrostab.regularise.place import Placement
 from gyrostab.regularise.survey import BLOCK
 from gyrostab.store.direct import can_fill, fill_row, held, stretch, with_fill
-from gyrostab.threads import in_order
-from gyrostab.timegrid import grid_times
+from gyrostab.store.threads import in_order
+from gyrostab.time.grid import grid_times
 
 __all__ = ["SMALL", "count_present", "gathered", "on_grid", "samples_of"]
 

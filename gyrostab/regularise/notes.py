@@ -13,7 +13,7 @@ from gyrostab.regularise.place import Placement
 from gyrostab.regularise.rate import RateEstimate
 from gyrostab.regularise.survey import Survey, file_of
 from gyrostab.schema import GAP_CAUSES, log_channels
-from gyrostab.timegrid import grid_times
+from gyrostab.time.grid import grid_times
 
 __all__ = ["describe", "describe_channels", "describe_rate"]
 

@@ -18,7 +18,7 @@ from gyrostab.regularise.course import Course, place_rows
 from gyrostab.regularise.rate import SECOND, RateEstimate, Stamps
 from gyrostab.regularise.survey import file_of
 from gyrostab.store.direct import stretch
-from gyrostab.timegrid import period_ns
+from gyrostab.time.grid import period_ns
 
 __all__ = ["Placement", "check_grid", "place_by_count", "place_by_course", "place_by_stamp", "place_without_time"]
 

@@ -19,7 +19,7 @@ from gyrostab.errors import TimeError
 from gyrostab.kernels.stamps import NO_STAMP, piece_sums, track
 from gyrostab.regularise.course import Course, count_along, find_course, follow_course
 from gyrostab.regularise.steps import cut, finer_period, refined
-from gyrostab.threads import in_order
+from gyrostab.store.threads import in_order
 
 __all__ = ["RateEstimate", "Stamps", "estimate_near", "estimate_rate", "is_far_worse", "odd_stretches", "starting_period"]
 

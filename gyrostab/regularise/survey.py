@@ -15,7 +15,7 @@ from gyrostab.errors import FormatError
 from gyrostab.schema import texts
 from gyrostab.store.direct import stretch
 from gyrostab.store.seen import Seen, look_at_cells
-from gyrostab.threads import in_order
+from gyrostab.store.threads import in_order
 
 __all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
 

@@ -20,9 +20,9 @@ from gyrostab.diagnose.conclusion.sentences import (
     without_chance,
 )
 from gyrostab.noise import LAWS
-from gyrostab.output import new_output
 from gyrostab.plot.style import embedded
 from gyrostab.report.page import page_text
+from gyrostab.store.output import new_output
 
 __all__ = ["write_diagnosis_report"]
 

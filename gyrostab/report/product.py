@@ -11,10 +11,10 @@ import xarray as xr
 
 from gyrostab.convert import as_log
 from gyrostab.noise import LAWS
-from gyrostab.output import new_output
 from gyrostab.plot.style import duration, embedded
 from gyrostab.report.page import page_text
 from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_product, texts
+from gyrostab.store.output import new_output
 
 if TYPE_CHECKING:
     from gyrostab.summary import TermSummary

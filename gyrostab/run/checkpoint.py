@@ -17,9 +17,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.export import CHUNK_VALUES
-from gyrostab.output import replace_file
-from gyrostab.parts import with_part
+from gyrostab.io.datasets import CHUNK_VALUES
+from gyrostab.store.output import replace_file
+from gyrostab.store.parts import with_part
 
 __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
 

@@ -31,7 +31,7 @@ def check_windows(
     Traceback (most recent call last):
     gyrostab.errors.OptionError: window 10 has no unit; write '10s' for seconds or '10samples' for samples
     """
-    from gyrostab.windows import TAUS, averaging_factors, duration_seconds, samples
+    from gyrostab.time.durations import TAUS, averaging_factors, duration_seconds, samples
 
     fine = 1e6  # Hz; the true rate is not known yet
     if window is None:  # chosen when the record is known

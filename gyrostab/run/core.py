@@ -15,7 +15,6 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
 from gyrostab.kernels.workspace import Workspaces
-from gyrostab.output import check_output, protect_inputs, remove_leftovers, resolve_link
 from gyrostab.progress import Stage, no_stage
 from gyrostab.run.checkpoint import find_blocks
 from gyrostab.run.checks import check_windows
@@ -38,6 +37,7 @@ from gyrostab.run.job import (
     seal_store,
 )
 from gyrostab.run.schedule import Pool, check_scheduler, open_pool
+from gyrostab.store.output import check_output, protect_inputs, remove_leftovers, resolve_link
 
 __all__ = ["load_log", "run", "samples_of"]
 
@@ -282,7 +282,7 @@ def _kept(job: _Job, what: str) -> str:
 
 def _is_log(path: Path) -> bool:
     """Whether a file is a log that gyrostab wrote, which every worker can open for itself."""
-    from gyrostab.export import open_log
+    from gyrostab.io.datasets import open_log
 
     try:
         open_log(path).close()
@@ -295,7 +295,7 @@ def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _
     """Compute what is missing of the job."""
     from gyrostab.davar import davar_parts
     from gyrostab.davar.plan import choose_window
-    from gyrostab.export import to_zarr
+    from gyrostab.io.datasets import to_zarr
 
     reading, windows, fitting = (job.options[name] for name in ("reading", "windows", "fitting"))
     store = job.folder / "log.zarr"

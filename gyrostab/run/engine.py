@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.davar import davar_part
-from gyrostab.export import to_netcdf
 from gyrostab.fit import fit_part
+from gyrostab.io.datasets import to_netcdf
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.progress import Stage
 from gyrostab.run.checkpoint import Block, assemble, write_block

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from gyrostab.errors import OutputError, ResumeError
-from gyrostab.output import describe_file, is_leftover, remove_leftovers, replace_file
-from gyrostab.output.content import read_json
+from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, replace_file
+from gyrostab.store.output.content import read_json
 
 __all__ = [
     "begin_job",

@@ -14,7 +14,7 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.base import STAGES, Chunk, Effect, Setup
 from gyrostab.simulate.drivers import Source, Stretch
 from gyrostab.simulate.noise import Units, shape
-from gyrostab.timegrid import grid_times
+from gyrostab.time.grid import grid_times
 
 __all__ = ["BlockState", "Plan", "Step", "check_effects", "next_block"]
 

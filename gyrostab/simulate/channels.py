@@ -11,9 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.timegrid import stamp_ns, time_coordinate
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import stamp_ns, time_coordinate
 from gyrostab.units import INNER, parse_unit
-from gyrostab.windows import duration_seconds
 
 __all__ = ["HELD", "Points", "channel", "check_points", "combine", "inner_unit", "piecewise"]
 

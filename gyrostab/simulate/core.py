@@ -14,7 +14,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.clock import time_of_day
 from gyrostab.convert import as_log
 from gyrostab.errors import OptionError, SchemaError, UnitError
 from gyrostab.gaps import gap_variables
@@ -27,9 +26,10 @@ from gyrostab.simulate.drivers import make_source
 from gyrostab.simulate.lazy import lazy_rates
 from gyrostab.simulate.model import PROFILES, Model, read_model
 from gyrostab.simulate.noise import begin_noise, stream
-from gyrostab.timegrid import first_stamp, grid_index, stamp_ns, time_coordinate
+from gyrostab.time.clock import time_of_day
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import first_stamp, grid_index, stamp_ns, time_coordinate
 from gyrostab.units import parse_unit
-from gyrostab.windows import duration_seconds
 
 __all__ = ["simulate"]
 

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
-from gyrostab.timegrid import TimeGridIndex, grid_index
+from gyrostab.time.grid import TimeGridIndex, grid_index
 
 __all__ = ["Source", "Stretch", "make_source"]
 

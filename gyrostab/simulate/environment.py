@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError
 from gyrostab.simulate.channels import HELD, Points, channel, check_points, combine, inner_unit, piecewise
 from gyrostab.simulate.turning import rotation
-from gyrostab.windows import duration_seconds
+from gyrostab.time.durations import duration_seconds
 
 __all__ = ["chamber", "light_power", "ramps", "rotation", "steps", "supply", "trip", "vibration"]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.simulate.block import BlockState, Plan, next_block
 from gyrostab.simulate.drivers import SHORT, Stretch
 from gyrostab.simulate.noise import NoiseState, draw
-from gyrostab.timegrid import grid_times
+from gyrostab.time.grid import grid_times
 
 __all__ = ["Chain", "lazy_rates"]
 

@@ -12,8 +12,8 @@ from gyrostab.errors import OptionError
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.simulate.channels import Points, check_points
 from gyrostab.simulate.noise import stream
-from gyrostab.timegrid import stamp_ns
-from gyrostab.windows import duration_seconds
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import stamp_ns
 
 __all__ = ["gaps", "losses", "power_cuts"]
 

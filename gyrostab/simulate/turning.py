@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.simulate.channels import HELD, Points, channel, check_points, combine
-from gyrostab.windows import duration_seconds
+from gyrostab.time.durations import duration_seconds
 
 __all__ = ["rotation"]
 

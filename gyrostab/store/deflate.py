@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.parts import read_part
 from gyrostab.store.lock import library_lock
+from gyrostab.store.parts import read_part
+from gyrostab.store.threads import in_order
 from gyrostab.store.write import Progress
-from gyrostab.threads import in_order
 
 __all__ = ["append_deflated", "large_variables"]
 

@@ -15,16 +15,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.cf import declared_grids, decode_stamps, index_dim
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.counts import from_counts
-from gyrostab.output import remember_source
+from gyrostab.store.cf import declared_grids, decode_stamps, index_dim
 from gyrostab.store.direct import with_fill
 from gyrostab.store.header import SMALL, Header, read_header
 from gyrostab.store.kept import KeptChunks
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
 from gyrostab.store.named import name_file
-from gyrostab.timegrid import grid_times
+from gyrostab.store.output import remember_source
+from gyrostab.time.grid import grid_times
 
 __all__ = ["open_stored"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import SchemaError, TimeError
 from gyrostab.gaps import clip_table
 from gyrostab.schema import check_log, signal_name
-from gyrostab.timegrid import TimeGridIndex, time_coordinate
+from gyrostab.time.grid import TimeGridIndex, time_coordinate
 from gyrostab.uniform.grid import UniformGrid, find_grid
 from gyrostab.uniform.place import place_samples
 from gyrostab.uniform.table import add_holes, change_rate, has_gap_table, read_table, with_table
@@ -24,7 +24,7 @@ def as_uniform(log: xr.Dataset) -> xr.Dataset:
 
     xarray keeps attributes through every operation, and tables of gaps through most of them. This function trusts neither: the
     sampling rate comes from ``time``, and the table of gaps is clipped, converted or dropped. A log whose time axis is computed
-    (see `gyrostab.timegrid`) is known to be uniform, and costs nothing. Explicit stamps are checked in blocks.
+    (see `gyrostab.time.grid`) is known to be uniform, and costs nothing. Explicit stamps are checked in blocks.
 
     Parameters
     ----------

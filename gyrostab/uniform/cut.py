@@ -12,16 +12,16 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.clock import time_of_day
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.gaps import clip_table
 from gyrostab.schema import GAP_CAUSES, check_log
-from gyrostab.timegrid import grid_index, grid_times, stamp_ns
+from gyrostab.time.clock import time_of_day
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import grid_index, grid_times, stamp_ns
 from gyrostab.uniform.core import grid_of
 from gyrostab.uniform.grid import UniformGrid
 from gyrostab.uniform.place import place_samples
 from gyrostab.uniform.table import add_spans, has_gap_table, read_table, with_table
-from gyrostab.windows import duration_seconds
 
 __all__ = ["cut_log", "parse_instant"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.limits import is_absurd_grid
-from gyrostab.timegrid import NANOSECONDS, grid_index
+from gyrostab.time.grid import NANOSECONDS, grid_index
 
 __all__ = ["ReadStamps", "UniformGrid", "find_grid"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.join.lazy import chunk_of, lay
 from gyrostab.schema import texts
 from gyrostab.store.direct import held
-from gyrostab.timegrid import time_coordinate
+from gyrostab.time.grid import time_coordinate
 
 __all__ = ["place_samples"]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import SchemaError
 from gyrostab.gaps import CAUSE, END, FIRST, ROWS, SAMPLES, gap_variables, thinned
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.timegrid import grid_index
+from gyrostab.time.grid import grid_index
 
 __all__ = ["add_holes", "add_spans", "change_rate", "has_gap_table", "read_table", "with_table"]
 

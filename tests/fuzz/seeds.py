@@ -150,7 +150,7 @@ def regular_log() -> Any:
 
 
 def netcdf_seeds() -> Iterator[Seed]:
-    from gyrostab.export import to_netcdf
+    from gyrostab.io.datasets import to_netcdf
     from gyrostab.run import load_log
 
     for form, row in (("NETCDF3_CLASSIC", "netcdf3"), ("NETCDF3_64BIT_OFFSET", "netcdf3"), ("NETCDF4", "netcdf4")):
@@ -171,7 +171,7 @@ def netcdf_seeds() -> Iterator[Seed]:
 def zarr_seeds() -> Iterator[Seed]:
     import xarray as xr
 
-    from gyrostab.export import to_zarr
+    from gyrostab.io.datasets import to_zarr
     from gyrostab.run import load_log
 
     with folder() as place:

@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.correlate import correlate, join
-from gyrostab.export import to_netcdf, to_zarr
+from gyrostab.io.datasets import to_netcdf, to_zarr
 from tests import synthetic
 
 HERE = Path(__file__).parent

@@ -60,8 +60,8 @@ def diagnose(
     from gyrostab.diagnose.core import diagnose as run_diagnosis
     from gyrostab.diagnose.core import quiet_span
     from gyrostab.diagnosis_folder import find_foreign_file, write_diagnosis
-    from gyrostab.output import check_output
     from gyrostab.run import load_log
+    from gyrostab.store.output import check_output
 
     check_output(output, overwrite=common.overwrite, find_foreign=find_foreign_file)
     spans = [quiet_span(text) for text in quiet or ()]

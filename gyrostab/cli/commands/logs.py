@@ -72,9 +72,9 @@ def ingest(
         Of a NetCDF file: zlib is read by every program; zstd is faster, but Octave, MATLAB and h5netcdf do not read it
         (default: zlib).
     """
-    from gyrostab.export import to_netcdf, to_zarr
-    from gyrostab.output import check_output
+    from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.run import load_log, samples_of
+    from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
     zarr = target.suffix.lower() == ".zarr"

@@ -37,9 +37,9 @@ def report(
         Log that the product was made of, to show the signal too.
     """
     from gyrostab.diagnosis_folder import open_diagnosis
-    from gyrostab.export import open_log, open_product
-    from gyrostab.output import check_output
+    from gyrostab.io.datasets import open_log, open_product
     from gyrostab.report import write_diagnosis_report, write_report
+    from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite)
     with work(common) as stage:
@@ -82,11 +82,11 @@ def correlate(
     """
     from gyrostab.correlate import correlate as compute
     from gyrostab.correlate import format_correlation, join
-    from gyrostab.export import open_product, to_netcdf
-    from gyrostab.output import check_output, new_output
+    from gyrostab.io.datasets import open_product, to_netcdf
     from gyrostab.plot.correlation import plot_correlation
     from gyrostab.plot.style import save_png
     from gyrostab.read.channel import read_channel
+    from gyrostab.store.output import check_output, new_output
 
     given, file = other.options(), other.channel
     target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite) if output else None
@@ -123,7 +123,7 @@ def plot(
     output
         Folder to write into.
     """
-    from gyrostab.export import open_product
+    from gyrostab.io.datasets import open_product
     from gyrostab.plot.figures import save_figures
 
     with work(common) as stage:
@@ -154,9 +154,9 @@ def export(
     format
         kalibr: N, K and B in radians, the worst axis and each of them; zarr: everything.
     """
-    from gyrostab.export import open_product, to_zarr
+    from gyrostab.io.datasets import open_product, to_zarr
     from gyrostab.kalibr import to_kalibr
-    from gyrostab.output import check_output
+    from gyrostab.store.output import check_output
 
     writers: dict[str, tuple[Any, list[str]]] = {"kalibr": (to_kalibr, [".yaml", ".yml"]), "zarr": (to_zarr, [".zarr"])}
     write, suffixes = writers[format]

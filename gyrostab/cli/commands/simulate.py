@@ -45,10 +45,10 @@ def simulate(
     seed
         Seed of the random numbers: the same log for the same seed, the same noise with and without effects (default: the model's, or 0).
     """
-    from gyrostab.export import to_netcdf, to_zarr
-    from gyrostab.output import check_output
+    from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.run import load_log, samples_of
     from gyrostab.simulate import simulate as make
+    from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
     with work(common) as stage:

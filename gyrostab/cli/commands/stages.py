@@ -87,9 +87,9 @@ def fit(
     output
         NetCDF file to write.
     """
-    from gyrostab.export import open_surface, to_netcdf
     from gyrostab.fit import fit_noise
-    from gyrostab.output import check_output
+    from gyrostab.io.datasets import open_surface, to_netcdf
+    from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite)
     with work(common) as stage:
@@ -102,7 +102,7 @@ def _print_product(target: Path) -> None:
     """Print what a product says, the command to run next, and the file."""
     from shlex import quote
 
-    from gyrostab.export import open_product
+    from gyrostab.io.datasets import open_product
     from gyrostab.summary import format_product
 
     with open_product(target) as product:

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.timegrid import stamp_ns
+from gyrostab.time.grid import stamp_ns
 
 __all__ = ["LEVEL_SPANS", "loudness", "quiet_blocks", "quiet_spans"]
 

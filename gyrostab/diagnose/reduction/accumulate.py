@@ -16,7 +16,7 @@ from gyrostab.errors import UnitError
 from gyrostab.kernels import periodogram as kernel
 from gyrostab.kernels.outliers import HISTOGRAM
 from gyrostab.simulate.drivers import Source, make_source
-from gyrostab.timegrid import first_stamp, grid_times
+from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
 __all__ = ["FINE", "FOLLOWED", "HARMONICS", "PARTS", "PHASES", "PIECES", "Accumulator"]

@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.schema import log_channels, signal_name
-from gyrostab.timegrid import TimeGridIndex, first_stamp, grid_index, grid_times
+from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_index, grid_times
 
 __all__ = ["TURNING", "Aligned", "align_channels"]
 

@@ -16,9 +16,9 @@ from gyrostab.errors import OptionError
 from gyrostab.kernels.smooth import smooth_curve
 from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import GAP_CAUSES, check_log, texts
-from gyrostab.timegrid import grid_index, grid_times
+from gyrostab.time.durations import duration_seconds, samples
+from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.units import INNER
-from gyrostab.windows import duration_seconds, samples
 
 __all__ = ["HARMONICS", "PARTS", "PHASES", "block_samples", "measured", "noise_at_orders", "reduce_log"]
 

@@ -2,7 +2,7 @@
 
 On disk the dimensions are ``(axis, tau, time)``, every time is an exact integer, every unit string is one that UDUNITS reads
 rightly, only data carries a fill value, and lists stand in the attributes as JSON. `open_dataset` turns all of that back
-(`gyrostab.cf` holds the rules; `gyrostab.store` the chunks of a log). A file takes its final name only once it is complete.
+(`gyrostab.store.cf` holds the rules; `gyrostab.store` the chunks of a log). A file takes its final name only once it is complete.
 """
 
 from __future__ import annotations
@@ -17,10 +17,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.cf import from_disk, index_dim, to_disk
 from gyrostab.convert import as_log
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, reading_of
-from gyrostab.output import find_foreign_item, find_sources, new_output
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
 from gyrostab.store import (
     Misfit,
@@ -35,6 +33,8 @@ from gyrostab.store import (
     long_variables,
     open_stored,
 )
+from gyrostab.store.cf import from_disk, index_dim, to_disk
+from gyrostab.store.output import find_foreign_item, find_sources, new_output
 
 __all__ = ["open_dataset", "open_log", "open_product", "open_surface", "to_netcdf", "to_zarr"]
 
@@ -88,7 +88,7 @@ def to_netcdf(
     Examples
     --------
     >>> import tempfile
-    >>> from gyrostab.timegrid import time_coordinate
+    >>> from gyrostab.time.grid import time_coordinate
     >>> log = xr.Dataset(
     ...     {"rate": (("axis", "time"), np.zeros((1, 4)), {"units": "degree hour-1"})},
     ...     coords={"axis": ["x"]},

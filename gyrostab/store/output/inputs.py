@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gyrostab.errors import FormatError
-from gyrostab.output.content import is_store
+from gyrostab.store.output.content import is_store
 
 __all__ = [
     "check_unchanged",
@@ -85,7 +85,7 @@ def protect_inputs(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[st
     Examples
     --------
     >>> import tempfile
-    >>> from gyrostab.output import check_output
+    >>> from gyrostab.store.output import check_output
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     log = Path(folder, "log.nc")
     ...     _ = log.write_text("samples")

@@ -17,9 +17,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from gyrostab.errors import GyrostabError, OutputError
-from gyrostab.output.check import check_folder, check_target
-from gyrostab.output.content import FindForeign
-from gyrostab.output.inputs import check_unchanged
+from gyrostab.store.output.check import check_folder, check_target
+from gyrostab.store.output.content import FindForeign
+from gyrostab.store.output.inputs import check_unchanged
 
 __all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "replace_file"]
 
@@ -47,9 +47,9 @@ def new_output(
         Replace what has this name.
     find_foreign : callable, optional
         Makes the output a folder, and finds what an existing one holds that must not be removed; see
-        `gyrostab.output.check_output`.
+        `gyrostab.store.output.check_output`.
     inputs : iterable of path-like
-        Files that a lazy dataset reads, which must not be replaced, in addition to those of `gyrostab.output.protect_inputs`.
+        Files that a lazy dataset reads, which must not be replaced, in addition to those of `gyrostab.store.output.protect_inputs`.
 
     Yields
     ------

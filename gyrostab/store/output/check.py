@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from gyrostab.errors import OptionError, OutputError
-from gyrostab.output.content import FindForeign, find_foreign_item, is_store
-from gyrostab.output.inputs import match_files, protected_inputs
+from gyrostab.store.output.content import FindForeign, find_foreign_item, is_store
+from gyrostab.store.output.inputs import match_files, protected_inputs
 
 __all__ = ["check_folder", "check_output", "check_target", "resolve_link"]
 
@@ -57,7 +57,7 @@ def check_output(
     overwrite : bool
         Whether an existing output may be replaced.
     inputs : iterable of path-like
-        Files that a lazy dataset reads, in addition to those of `gyrostab.output.protect_inputs`.
+        Files that a lazy dataset reads, in addition to those of `gyrostab.store.output.protect_inputs`.
     find_foreign : callable, optional
         Makes the output a folder: finds what it holds that must not be removed. By default the output is a Zarr store when its
         name ends in ``.zarr``, else a file.

@@ -18,12 +18,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.clock import time_of_day
 from gyrostab.errors import FormatError, SchemaError
-from gyrostab.names import restore_names, store_names
-from gyrostab.parts import transposed
 from gyrostab.schema import check_log, check_product, check_surface, texts
-from gyrostab.timegrid import TimeGridIndex, grid_times, time_coordinate
+from gyrostab.store.names import restore_names, store_names
+from gyrostab.store.parts import transposed
+from gyrostab.time.clock import time_of_day
+from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import ON_DISK, on_disk
 
 __all__ = ["PACKING", "declared_grids", "decode_stamps", "from_disk", "index_dim", "to_disk"]
