@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gyrostab.davar import davar
 from gyrostab.fit import fit_noise
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import LAWS, model_avar
 from gyrostab.simulate import simulate
 

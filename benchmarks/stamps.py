@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from gyrostab.regularise import regularise
+from gyrostab.ingest.grid.regularise import regularise
 from tests.raw_rows import raw_log
 from tests.stamp_scatter import JITTER, LOSSES, UNITS, lose_samples, round_stamps, scatter_stamps
 

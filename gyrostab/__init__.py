@@ -19,8 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gyrostab.confidence import confidence_interval as confidence_interval
-    from gyrostab.convert import from_dataarray as from_dataarray
-    from gyrostab.convert import from_dataframe as from_dataframe
     from gyrostab.correlate import correlate as correlate
     from gyrostab.correlate import correlation_rows as correlation_rows
     from gyrostab.davar import davar as davar
@@ -28,13 +26,20 @@ if TYPE_CHECKING:
     from gyrostab.diagnosis_folder import open_diagnosis as open_diagnosis
     from gyrostab.diagnosis_folder import write_diagnosis as write_diagnosis
     from gyrostab.fit import fit_noise as fit_noise
+    from gyrostab.ingest import read_channel as read_channel
+    from gyrostab.ingest import read_log as read_log
+    from gyrostab.ingest.convert import from_dataarray as from_dataarray
+    from gyrostab.ingest.convert import from_dataframe as from_dataframe
+    from gyrostab.ingest.grid.regularise import gap_table as gap_table
+    from gyrostab.ingest.grid.regularise import regularise as regularise
+    from gyrostab.ingest.make_log import make_log as make_log
+    from gyrostab.ingest.scan import scan as scan
     from gyrostab.io.datasets import open_log as open_log
     from gyrostab.io.datasets import open_product as open_product
     from gyrostab.io.datasets import open_surface as open_surface
     from gyrostab.io.datasets import to_netcdf as to_netcdf
     from gyrostab.io.datasets import to_zarr as to_zarr
     from gyrostab.kalibr import to_kalibr as to_kalibr
-    from gyrostab.log import make_log as make_log
     from gyrostab.plot import plot_adev as plot_adev
     from gyrostab.plot import plot_coefficients as plot_coefficients
     from gyrostab.plot import plot_correlation as plot_correlation
@@ -43,12 +48,7 @@ if TYPE_CHECKING:
     from gyrostab.plot import plot_signal as plot_signal
     from gyrostab.plot import save_figures as save_figures
     from gyrostab.prove import prove as prove
-    from gyrostab.read import read_channel as read_channel
-    from gyrostab.read import read_log as read_log
-    from gyrostab.regularise import gap_table as gap_table
-    from gyrostab.regularise import regularise as regularise
     from gyrostab.report import write_report as write_report
-    from gyrostab.scan import scan as scan
     from gyrostab.simulate import make_noise as make_noise
     from gyrostab.simulate import read_model as read_model
     from gyrostab.simulate import simulate as simulate
@@ -61,10 +61,10 @@ _HOME = {
     "davar": "davar",
     "diagnose": "diagnose.core",
     "fit_noise": "fit",
-    "from_dataarray": "convert",
-    "from_dataframe": "convert",
-    "gap_table": "regularise",
-    "make_log": "log",
+    "from_dataarray": "ingest.convert",
+    "from_dataframe": "ingest.convert",
+    "gap_table": "ingest.grid.regularise",
+    "make_log": "ingest.make_log",
     "make_noise": "simulate",
     "open_diagnosis": "diagnosis_folder",
     "open_log": "io.datasets",
@@ -77,12 +77,12 @@ _HOME = {
     "plot_davar_3d": "plot",
     "plot_signal": "plot",
     "prove": "prove",
-    "read_channel": "read",
-    "read_log": "read",
+    "read_channel": "ingest",
+    "read_log": "ingest",
     "read_model": "simulate",
-    "regularise": "regularise",
+    "regularise": "ingest.grid.regularise",
     "save_figures": "plot",
-    "scan": "scan",
+    "scan": "ingest.scan",
     "simulate": "simulate",
     "to_kalibr": "kalibr",
     "to_netcdf": "io.datasets",

@@ -93,7 +93,7 @@ def fit_noise(
 
     Examples
     --------
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)  # 6 deg/h at 100 Hz: N = 0.6 / 60 deg/sqrt(h)
     >>> from gyrostab.davar import davar
     >>> product = fit_noise(davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min"))
@@ -121,7 +121,7 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
     Examples
     --------
     >>> from gyrostab.davar import davar
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> log = make_log(np.random.default_rng(1).standard_normal(60_000), rate=100.0, unit="deg/h")
     >>> product = fit_noise(davar(log, window="1min"), terms="NB")
     >>> bool(product.B.isnull().any()), bool(refit(product).B.isnull().any())
@@ -173,7 +173,7 @@ def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
     Examples
     --------
     >>> from gyrostab.davar import davar_part
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> log = make_log(np.random.default_rng(1).standard_normal(60_000), rate=100.0, unit="deg/h")
     >>> surface = davar_part(log, part=slice(0, 4), window="1min")
     >>> fit_part(surface, terms="NK").equals(fit_noise(surface, terms="NK"))

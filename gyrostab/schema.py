@@ -156,7 +156,7 @@ _MAKERS = {"raw log": "gyrostab.read_log", "log": "gyrostab.make_log", "DAVAR su
 
 
 def check_raw(raw: xr.Dataset) -> None:
-    """Raise `SchemaError` unless `raw` is what a reader returns (see `gyrostab.read`)."""
+    """Raise `SchemaError` unless `raw` is what a reader returns (see `gyrostab.ingest`)."""
     name = signal_name(raw)
     _require(raw, "raw log", {name: ("axis", "row")})
     _check_units(raw, name)
@@ -165,8 +165,8 @@ def check_raw(raw: xr.Dataset) -> None:
 def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
     """Raise `SchemaError` unless `log` has what a regular log has: ``time``, a signal ``(axis, time)`` with units, a rate.
 
-    Whether ``time`` is uniform, and the rate true, is checked by `gyrostab.uniform.as_uniform`, which every function that takes a log
-    calls. With ``rate=False`` the attribute ``sampling_rate_hz`` may be absent.
+    Whether ``time`` is uniform, and the rate true, is checked by `gyrostab.ingest.uniform.as_uniform`, which every function that takes
+    a log calls. With ``rate=False`` the attribute ``sampling_rate_hz`` may be absent.
     """
     if "row" in log.dims:
         raise SchemaError("these are raw rows with their stamps as written; call gyrostab.regularise(raw) first")

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import gyrostab
 from gyrostab.errors import GyrostabError
+from gyrostab.ingest.scan import print_scan
 from gyrostab.run import load_log, run
-from gyrostab.scan import print_scan
 
 
 def find_logs(folder, *, pattern):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.davar import davar
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.base import Chunk, Effect, Setup, Windows
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.gaps import gap_variables
+from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.time.grid import grid_times, time_coordinate
 
 RATE = 50.0

@@ -40,8 +40,8 @@ def test_import_loads_nothing_heavy(code, banned):
 def test_public_names_are_functions_whatever_was_imported_first():
     code = (
         "import gyrostab, types\n"
-        "from gyrostab.scan import COLUMNS\n"
-        "import gyrostab.regularise, gyrostab.davar\n"
+        "from gyrostab.ingest.scan import COLUMNS\n"
+        "import gyrostab.ingest.grid.regularise, gyrostab.davar\n"
         "bad = [n for n in gyrostab.__all__ if n != '__version__' and not isinstance(getattr(gyrostab, n), types.FunctionType)]\n"
         "print(bad)"
     )

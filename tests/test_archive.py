@@ -14,11 +14,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, TimeError, UnitError
+from gyrostab.ingest import read_log
+from gyrostab.ingest.concat import join_logs
+from gyrostab.ingest.concat.grid import runs_of
+from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.io import datasets as export
-from gyrostab.join import join_logs
-from gyrostab.join.grid import runs_of
-from gyrostab.read import read_log
-from gyrostab.regularise import gap_table, regularise
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import TimeGridIndex, grid_times
 from tests.regular_logs import RATE, SIZE, START, cut, log_of, nan_runs, rechunked, said, signal
@@ -315,7 +315,7 @@ READ_THROUGH = """
 import sys, warnings
 from pathlib import Path
 import dask
-from gyrostab.read import read_log
+from gyrostab.ingest import read_log
 
 def most():
     lines = Path("/proc/self/status").read_text().splitlines()

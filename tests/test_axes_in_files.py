@@ -12,9 +12,10 @@ from pyarrow import parquet
 
 import gyrostab
 from gyrostab.errors import SchemaError, TimeError
-from gyrostab.join import group_axes
-from gyrostab.read import ReadOptions, buffers, files, read_log, scan_file
-from gyrostab.regularise import gap_table, regularise
+from gyrostab.ingest import ReadOptions, files, read_log, scan_file
+from gyrostab.ingest.columns import buffers
+from gyrostab.ingest.concat import group_axes
+from gyrostab.ingest.grid.regularise import gap_table, regularise
 
 N, PERIOD_NS = 2000, 10_000_000
 START = np.datetime64("2026-03-01T06:00:00", "ns").astype(np.int64)

@@ -18,10 +18,12 @@ import zarr
 from gyrostab import davar, make_log, read_log, regularise, scan, to_netcdf, to_zarr
 from gyrostab.davar import davar_part
 from gyrostab.errors import FormatError, OptionError, TimeError
-from gyrostab.limits import check_limits
-from gyrostab.read import ReadOptions, arrays, matlab
-from gyrostab.read import netcdf as netcdf_reader
-from gyrostab.read.pieces import Spool
+from gyrostab.ingest import ReadOptions
+from gyrostab.ingest.columns import typed as arrays
+from gyrostab.ingest.columns.pieces import Spool
+from gyrostab.ingest.formats import matlab
+from gyrostab.ingest.formats import netcdf as netcdf_reader
+from gyrostab.ingest.limits import check_limits
 
 regularise_module = sys.modules["gyrostab.regularise"]  # the package has a function of that name
 

@@ -19,8 +19,8 @@ import xarray as xr
 
 from gyrostab.__main__ import main as start
 from gyrostab.cli import app
+from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_log, open_product, open_surface, to_netcdf
-from gyrostab.log import make_log
 from tests.command_line import N_TRUE, WINDOW, call, stopped, write_log
 
 COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "report", "plot", "export", "simulate", "diagnose")

@@ -14,8 +14,8 @@ import pytest
 import xarray as xr
 
 from gyrostab.errors import OutputError
+from gyrostab.ingest.columns.buffers import Buffers
 from gyrostab.io.datasets import open_log, open_product, to_netcdf
-from gyrostab.read.buffers import Buffers
 from gyrostab.run import load_log
 from tests.command_line import RATE, WINDOW, call, stopped, write_log
 
@@ -179,7 +179,7 @@ def test_full_standard_output_is_explained(log):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_no_room_for_the_columns_of_a_long_log(monkeypatch):
     full = Path("/dev/full").open("wb")  # noqa: SIM115
-    monkeypatch.setattr("gyrostab.read.pieces.tempfile.TemporaryFile", lambda **options: full)
+    monkeypatch.setattr("gyrostab.ingest.columns.pieces.tempfile.TemporaryFile", lambda **options: full)
     with pytest.raises(OutputError, match=r"cannot be written.*TMPDIR"):
         Buffers({0: np.float64}, limit=100).add({0: np.zeros(1000)})
 

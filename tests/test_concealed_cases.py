@@ -26,7 +26,7 @@ from gyrostab.concealed.visible import FAINT
 from gyrostab.concealed.wander import wander_size
 from gyrostab.concealed.world import AXES, draw_world, stream
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.regularise import gap_table
+from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.schema import check_log
 
 EVERY = CATALOGUE | STRANGE
@@ -408,7 +408,7 @@ def test_salt_on_a_log_of_counts_is_counted_and_keeps_its_mean():
 def test_salt_on_a_real_gyro(recordings):
     import pandas as pd
 
-    from gyrostab.log import make_log
+    from gyrostab.ingest.make_log import make_log
 
     table = pd.read_csv(recordings("rlg-static-30min/lasergyro.csv.gz"), nrows=60_000)
     gyros = [column for column in table.columns if column.lower().startswith(("gyro", "w", "g"))][:3]

@@ -10,9 +10,9 @@ import xarray as xr
 import gyrostab
 from gyrostab.cli import main
 from gyrostab.errors import OptionError
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
+from gyrostab.ingest.uniform import cut_log
 from gyrostab.run import load_log
-from gyrostab.uniform import cut_log
 from tests.reference import direct_surface
 
 START = "2026-03-01T10:00:00"

@@ -13,7 +13,7 @@ from gyrostab.diagnose.effects.generics import generic_candidates, splines
 from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.gains.gain import cell_factors, power_factors
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import simulate
 from tests.named import COEFFICIENT, WORLD, record

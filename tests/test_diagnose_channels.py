@@ -19,7 +19,7 @@ from gyrostab.diagnose.effects.candidates import effect_candidates
 from gyrostab.diagnose.effects.channel_use import unused_channels
 from gyrostab.diagnose.reduction.aligned import align_channels
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.time.grid import time_coordinate
 
 RATE, SIZE = 100.0, 3000

@@ -17,7 +17,7 @@ from gyrostab.diagnose.gains.folds import fold_blocks
 from gyrostab.diagnose.naming.complete import unrest
 from gyrostab.diagnose.naming.name import _Search, name_effects
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from tests.named import nulls
 
 BLOCKS, LENGTH = 120, 200

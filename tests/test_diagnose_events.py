@@ -21,7 +21,7 @@ from gyrostab.diagnose.naming.structure import possible
 from gyrostab.diagnose.naming.surrogates import beats_slides
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views import locked
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from tests.named import nulls
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -18,7 +18,7 @@ from gyrostab.diagnose.naming.filters import filter_sizes, on_all_axes
 from gyrostab.diagnose.naming.parts import by_key, gain_sum
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 
 
 @pytest.mark.parametrize(

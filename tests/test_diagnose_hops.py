@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.gains.hops import Hops, hop_gain, hop_powers
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 
 BLOCKS, PIECES, STEP, WHITE = 60, 16, 20.0, 0.01
 WALKS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0])

@@ -15,7 +15,7 @@ from gyrostab.diagnose.naming.jumps import jumps_at_will, sudden
 from gyrostab.diagnose.naming.parts import by_key, gain_sum
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 
 MODEL = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x", "y"]}}
 MIDDLE = 905.0  # inside a block

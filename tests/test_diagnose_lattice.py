@@ -16,7 +16,7 @@ from gyrostab.diagnose.naming.name import name_effects
 from gyrostab.diagnose.naming.structure import structural
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.reduction.zero_cell import cut_off, may_be_cut_off
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from tests.named import nulls
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -19,7 +19,7 @@ from gyrostab.diagnose.naming.hopping import followed_first, hops_alone
 from gyrostab.diagnose.naming.name import name_effects
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
 from tests.named import nulls
 

@@ -22,7 +22,7 @@ from gyrostab.diagnose.naming.name import name_effects
 from gyrostab.diagnose.naming.odd import line_size
 from gyrostab.diagnose.naming.parts import by_key, without_lines
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from tests.named import nulls
 
 WEIGHT = np.full((1, 8), 22.0)

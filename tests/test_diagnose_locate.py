@@ -12,7 +12,7 @@ from gyrostab.diagnose.locating.locate import locate
 from gyrostab.diagnose.locating.null_scores import null_scores
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from tests.reduced_records import BLOCK_S, RATE, baseline, chunks, records, smallest_p
 
 SIGMA = 1.8  # of a sample [deg/h]: 0.003 deg/sqrt(h) at 100 Hz

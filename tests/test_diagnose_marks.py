@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gyrostab.diagnose.reduction.outliers import lattice_step
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 
 RATE = 100.0
 

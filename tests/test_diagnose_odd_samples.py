@@ -14,7 +14,7 @@ from gyrostab.diagnose.modelling.recalibrate import recalibrate
 from gyrostab.diagnose.modelling.refit import fit_claims
 from gyrostab.diagnose.naming.name import Naming, name_effects
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.effect_bench import run
 from tests.named import nulls

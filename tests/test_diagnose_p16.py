@@ -17,7 +17,7 @@ from gyrostab.diagnose.effects.explained import Part, without_turns
 from gyrostab.diagnose.naming.claims import Claim, Naming
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views import cross_axis, distribution, spectrum
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 
 from .conftest import ROOT
 from .scripts import load_script

@@ -16,7 +16,7 @@ from gyrostab.diagnose.naming.parts import by_key
 from gyrostab.diagnose.naming.steady import always_there
 from gyrostab.diagnose.naming.structure import possible
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 
 MODEL = {"noise": {"N": 0.003}, "log": {"axes": ["x"]}}
 SECOND = np.arange(24_000) / 10.0

@@ -14,8 +14,8 @@ from gyrostab.diagnose.locating.null_scores import null_scores, standardise
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views import VIEWS, cross_axis, davar, distribution, locked, mean, restart, spectrum
 from gyrostab.diagnose.views.cells import cube_root_score, exponential_score, over_windows, window_set
+from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
-from gyrostab.log import make_log
 from gyrostab.noise import LAWS
 from tests.reduced_records import BLOCK_S, RATE, baseline, chunks, records
 
@@ -200,7 +200,7 @@ def test_mean_estimates_the_step(base):
 
 def test_a_line_has_its_amplitude():
     from gyrostab.diagnose.reduction.reduced import reduce_log
-    from gyrostab.log import make_log
+    from gyrostab.ingest.make_log import make_log
 
     rng, n = np.random.default_rng(6), 180_000
     rate = 1.8 * rng.standard_normal((1, n)) + 0.3 * np.sin(2 * np.pi * 13.37 * np.arange(n) / RATE)

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gyrostab.errors import OptionError
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.plot import plot_comparison
 from tests.conftest import ROOT

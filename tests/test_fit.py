@@ -17,12 +17,12 @@ from gyrostab.confidence import confidence_interval
 from gyrostab.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.fit import fit_noise
+from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.covariance import product_tables
 from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
 from gyrostab.kernels.limits import cell_limits, interpolate_quantile
 from gyrostab.kernels.nonnegative import solve_nonnegative
 from gyrostab.kernels.pairs import white_pair_sum
-from gyrostab.log import make_log
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import OBSERVABLE
 from tests.noise_records import flicker, lose, quantization, random_walk, white

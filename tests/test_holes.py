@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gyrostab.davar import davar
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 
 
 @pytest.mark.parametrize(("present", "estimator"), [(4, 0), (6, 2)])

@@ -27,8 +27,8 @@ from scipy.io import savemat
 
 import gyrostab
 from gyrostab.errors import GyrostabError
-from gyrostab.read import read_log
-from gyrostab.regularise import regularise
+from gyrostab.ingest import read_log
+from gyrostab.ingest.grid.regularise import regularise
 
 #: Without the search for an explanation, which takes minutes after a failure.
 PHASES = (Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink)

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gyrostab
-from gyrostab.convert import as_log
 from gyrostab.errors import GyrostabError, MissingUnitError, OptionError, SchemaError, TimeError, UnitError
-from gyrostab.log import make_log
+from gyrostab.ingest.convert import as_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.time.grid import TimeGridIndex
 from tests.reference import direct_angle_surface, direct_surface
 from tests.regular_logs import log_of, signal

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 
 from gyrostab.davar import davar
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import LAWS, TERMS, URAD_PER_S, avar_columns, model_avar, sample_squares
 from tests.noise_records import flicker, quantization, random_walk, white
 

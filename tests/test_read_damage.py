@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
 
 from gyrostab.errors import FormatError
-from gyrostab.read.mat5 import check_structure
+from gyrostab.ingest.formats.matlab5 import check_structure
 
 
 @pytest.fixture(scope="module")

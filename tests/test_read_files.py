@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import gyrostab.read.files as files
+import gyrostab.ingest.files as files
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, UnitError
-from gyrostab.read import FileSummary, ReadOptions, read_log, readers, scan_file
+from gyrostab.ingest import FileSummary, ReadOptions, read_log, readers, scan_file
 from gyrostab.schema import check_log, check_raw
 from gyrostab.time.grid import TimeGridIndex, time_coordinate
 
@@ -345,6 +345,8 @@ def test_a_format_of_another_package_is_found(tmp_path: Path, monkeypatch: pytes
 
 
 def test_heavy_libraries_load_when_they_are_used() -> None:
-    code = "import sys, gyrostab.read; print([m for m in ('pyarrow.csv', 'netCDF4', 'h5py', 'scipy.io', 'dask.array') if m in sys.modules])"
+    code = (
+        "import sys, gyrostab.ingest; print([m for m in ('pyarrow.csv', 'netCDF4', 'h5py', 'scipy.io', 'dask.array') if m in sys.modules])"
+    )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

@@ -11,8 +11,8 @@ import pytest
 import xarray as xr
 
 from gyrostab.errors import GyrostabError, MissingUnitError, UnitError
-from gyrostab.read import read_log
-from gyrostab.read.headers import split_header
+from gyrostab.ingest import read_log
+from gyrostab.ingest.columns.headers import split_header
 
 
 def write(folder: Path, text: str, name: str = "log.csv") -> Path:

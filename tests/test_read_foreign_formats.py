@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gyrostab.errors import FormatError, MissingUnitError
-from gyrostab.read import read_log, scan_file
+from gyrostab.ingest import read_log, scan_file
 
 RATE = 50.0
 ROWS = 3000

@@ -17,9 +17,9 @@ from pyarrow import parquet
 from scipy.io import savemat
 
 from gyrostab.errors import FormatError, MissingUnitError, OptionError
-from gyrostab.read import ReadOptions, read_log, readers, scan_file
-from gyrostab.read.buffers import Buffers, lazily, put, take
-from gyrostab.read.pieces import Pieces, Spool
+from gyrostab.ingest import ReadOptions, read_log, readers, scan_file
+from gyrostab.ingest.columns.buffers import Buffers, lazily, put, take
+from gyrostab.ingest.columns.pieces import Pieces, Spool
 from gyrostab.schema import check_raw
 
 ROWS = 500
@@ -180,7 +180,7 @@ def test_a_scan_agrees_with_the_reading(made: tuple[Path, dict[str, Any]]) -> No
 def test_columns_on_disk_hold_what_columns_in_memory_hold(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     path, options = made
     in_memory = read_log(path, **options)
-    module = __import__(f"gyrostab.read.{scan_file(path).format}", fromlist=["read"])
+    module = __import__(f"gyrostab.ingest.{scan_file(path).format}", fromlist=["read"])
     on_disk = module.read(path, ReadOptions(**options), limit=1000)
     assert on_disk.rate.chunks is not None
     assert on_disk.time.chunks is not None

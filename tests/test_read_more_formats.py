@@ -13,8 +13,8 @@ import pytest
 import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
-from gyrostab.read import ReadOptions, read_log, scan_file
-from gyrostab.regularise import gap_table, regularise
+from gyrostab.ingest import ReadOptions, read_log, scan_file
+from gyrostab.ingest.grid.regularise import gap_table, regularise
 
 Find = Callable[[str], Path]
 ROWS = 500

@@ -12,11 +12,13 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gyrostab.ingest import files, read_log
+from gyrostab.ingest.columns import buffers
+from gyrostab.ingest.columns.pieces import Counts, Pieces, Spool, Steps, Words
+from gyrostab.ingest.combine import memory
+from gyrostab.ingest.formats import text
 from gyrostab.kernels.decimals import decimals_of, even_steps, from_decimals, to_decimals, unroll_steps
 from gyrostab.kernels.stamps import NO_STAMP, new_state, place
-from gyrostab.read import buffers, files, read_log, text
-from gyrostab.read.combine import memory
-from gyrostab.read.pieces import Counts, Pieces, Spool, Steps, Words
 from gyrostab.store.threads import in_order
 
 

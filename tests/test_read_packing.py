@@ -13,8 +13,8 @@ import xarray as xr
 import zarr
 
 from gyrostab.errors import FormatError, UnitError
-from gyrostab.read import read_log
-from gyrostab.read.packing import Packing
+from gyrostab.ingest import read_log
+from gyrostab.ingest.formats.packing import Packing
 
 ROWS = 60
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from gyrostab.errors import OptionError
-from gyrostab.read import read_log, scan_file
-from gyrostab.read.preset import preset_names
+from gyrostab.ingest import read_log, scan_file
+from gyrostab.ingest.columns.preset import preset_names
 
 RAD = math.degrees(1) * 3600  # deg/h
 

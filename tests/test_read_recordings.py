@@ -15,7 +15,7 @@ import xarray as xr
 from scipy.io import loadmat
 
 from gyrostab.errors import MissingUnitError
-from gyrostab.read import read_log, scan_file
+from gyrostab.ingest import read_log, scan_file
 
 Find = Callable[[str], Path]
 DPS = {f"g{axis}_dps": f"gyro_{axis}" for axis in "xyz"}

@@ -13,10 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, UnitError
-from gyrostab.read import ReadOptions, read_log, scan_file
-from gyrostab.read import text as text_reader
-from gyrostab.read.layout import find_layout
-from gyrostab.read.stamps import NAT, cells_to_ns, floats_to_ns, integers_to_ns, looks_iso, parse_time_unit
+from gyrostab.ingest import ReadOptions, read_log, scan_file
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, floats_to_ns, integers_to_ns, looks_iso, parse_time_unit
+from gyrostab.ingest.formats import text as text_reader
+from gyrostab.ingest.text.layout import find_layout
 
 from .text_logs import PLAIN, ns, write
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
-from gyrostab.read import read_log
+from gyrostab.ingest import read_log
 from gyrostab.units import INNER
 
 from .text_logs import PLAIN, ns, write

@@ -15,8 +15,8 @@ import pytest
 from pyarrow import parquet
 
 from gyrostab.errors import FormatError, OptionError, UnitError
-from gyrostab.read import read_log, scan_file
-from gyrostab.read.stamps import NAT, dates_to_ns, integers_to_ns, parse_time_unit
+from gyrostab.ingest import read_log, scan_file
+from gyrostab.ingest.columns.stamps import NAT, dates_to_ns, integers_to_ns, parse_time_unit
 from gyrostab.time.grid import stamp_ns
 
 ROWS = 40

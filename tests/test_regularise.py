@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, OptionError, TimeError
-from gyrostab.regularise import gap_table, regularise
-from gyrostab.regularise.fill import on_grid
-from gyrostab.regularise.place import place_by_stamp
+from gyrostab.ingest.grid.fill import on_grid
+from gyrostab.ingest.grid.place import place_by_stamp
+from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.schema import check_log
 
 from .raw_rows import START, expected, raw_log, stamps_of
@@ -130,7 +130,7 @@ def test_lazy_arrays_equal_those_in_memory(chunk, monkeypatch):
     raw = raw_log(stamps_of(samples, 300.0), values)
     truth = np.full((2, samples[-1] + 1), np.nan)
     truth[:, samples] = values
-    monkeypatch.setattr(sys.modules["gyrostab.regularise.fill"], "SMALL", 10)
+    monkeypatch.setattr(sys.modules["gyrostab.ingest.grid.fill"], "SMALL", 10)
     for signal in (values, da.from_array(values, chunks=(1, 1234))):
         log = regularise(raw.assign(rate=raw.rate.copy(data=signal)), chunk=chunk)
         assert isinstance(log.rate.data, da.Array)

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import TimeError
-from gyrostab.regularise import gap_table, regularise
+from gyrostab.ingest.grid.regularise import gap_table, regularise
 
 from .raw_rows import START, raw_log, stamps_of
 from .stamp_scatter import JITTER, LOSSES, PACKET, lose_samples, round_stamps, scatter_stamps

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from gyrostab.errors import TimeError
-from gyrostab.regularise import gap_table, regularise
-from gyrostab.regularise.place import place_by_stamp
-from gyrostab.regularise.rate import estimate_rate
+from gyrostab.ingest.grid.place import place_by_stamp
+from gyrostab.ingest.grid.rate import estimate_rate
+from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.time.grid import time_coordinate
 
 from .raw_rows import START, expected, raw_log, stamps_of

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gyrostab.regularise import gap_table, regularise
+from gyrostab.ingest.grid.regularise import gap_table, regularise
 
 from .raw_rows import raw_log
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.regularise import gap_table, regularise
+from gyrostab.ingest.grid.regularise import gap_table, regularise
 
 from .raw_rows import raw_log, stamps_of
 

@@ -12,9 +12,9 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
+from gyrostab.ingest.guess import EARTH_RATE_DPH, guess_columns, rate_plausibility
+from gyrostab.ingest.inspect import look_into
 from gyrostab.io.datasets import open_product
-from gyrostab.read.guess import EARTH_RATE_DPH, guess_columns, rate_plausibility
-from gyrostab.read.look import look_into
 from tests.command_line import call
 
 RATE = 100.0

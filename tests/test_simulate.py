@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from gyrostab.davar import davar
 from gyrostab.errors import SchemaError
+from gyrostab.ingest.grid.regularise import gap_table
+from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_log, to_netcdf
-from gyrostab.log import make_log
 from gyrostab.physics.registry import effects
-from gyrostab.regularise import gap_table
 from gyrostab.schema import check_log
 from gyrostab.simulate import drivers, lazy, read_model, simulate
 from gyrostab.simulate.lazy import Chain

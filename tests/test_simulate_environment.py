@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.regularise import gap_table
+from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.simulate import combine, simulate
 from gyrostab.simulate import environment as env
 from gyrostab.simulate.losses import gaps, losses, power_cuts

@@ -10,8 +10,8 @@ import pytest
 
 from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, SchemaError
+from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.io.datasets import open_log
-from gyrostab.regularise import gap_table
 from gyrostab.schema import check_log
 from gyrostab.simulate import read_model, simulate
 from gyrostab.simulate.model import PROFILES

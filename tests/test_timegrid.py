@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError
-from gyrostab.log import make_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_index, grid_times, time_coordinate
 
 START = pd.Timestamp("2026-11-20T23:59:59.123456789").value

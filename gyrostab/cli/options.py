@@ -12,7 +12,7 @@ from cyclopts import Group, Parameter
 from cyclopts.validators import Number
 
 from gyrostab.errors import OptionError
-from gyrostab.limits import check_limits
+from gyrostab.ingest.limits import check_limits
 
 __all__ = ["ChannelFile", "Common", "Fitting", "Flag", "Reading", "Running", "Windows", "read_toml"]
 

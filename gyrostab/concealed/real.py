@@ -73,8 +73,8 @@ def plan_salted(number: int, *, seed: int) -> list[dict[str, Any]]:
 
 
 def _piece(recording: str, folder: Path, part: float) -> xr.Dataset:
-    from gyrostab.read import read_log
-    from gyrostab.regularise import regularise
+    from gyrostab.ingest import read_log
+    from gyrostab.ingest.grid.regularise import regularise
 
     entry = REAL[recording]
     log = regularise(read_log(folder / entry.file, map=entry.columns, unit=entry.units, rate=entry.rate))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.concealed import floor, tool
 from gyrostab.concealed.environment import sense
 from gyrostab.concealed.world import AXES, QUICK, Effect, World, stream, to_samples
-from gyrostab.gaps import gap_variables
+from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.schema import check_log
 from gyrostab.time.grid import time_coordinate
 

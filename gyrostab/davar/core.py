@@ -14,10 +14,10 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.convert import as_log
 from gyrostab.davar.channels import window_channels
 from gyrostab.davar.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
 from gyrostab.errors import OptionError
+from gyrostab.ingest.convert import as_log
 from gyrostab.kernels.covariance import diagonal_products
 from gyrostab.kernels.least_squares import identify_noise
 from gyrostab.kernels.outlier_count import count_outliers
@@ -124,7 +124,7 @@ def davar(
 
     Examples
     --------
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> noise = np.random.default_rng(1).standard_normal(60_000)
     >>> surface = davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min", step="30s", taus=[0.01, 1.0])
     >>> surface.avar.sel(axis="x").dims, surface.sizes["time"]
@@ -163,7 +163,7 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
 
     Examples
     --------
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> davar_parts(make_log(np.zeros(10**6), rate=100.0, unit="deg/h"), samples=500_000, window="1min", step="30s")
     [slice(0, 85, None), slice(85, 170, None), slice(170, 255, None), slice(255, 332, None)]
     """
@@ -208,7 +208,7 @@ def davar_part(log: xr.Dataset, *, part: slice, space: Workspace | None = None, 
 
     Examples
     --------
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> log = make_log(np.arange(60_000.0) % 7, rate=100.0, unit="deg/h")
     >>> part = davar_part(log, part=slice(3, 5), window="1min", step="30s")
     >>> part.equals(davar(log, window="1min", step="30s").isel(time=slice(3, 5)))

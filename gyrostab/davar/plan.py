@@ -39,7 +39,7 @@ def make_plan(
     overlap: str = "full", gaps: str = "bridge", min_strict: float = 0.3, min_coverage: float = 0.1, method: str = "blocks",
     convention: str = "all",
 ) -> Plan:  # fmt: skip
-    """Check the options of `davar` against the log, as `gyrostab.convert.as_log` returns it."""
+    """Check the options of `davar` against the log, as `gyrostab.ingest.convert.as_log` returns it."""
     _check_choices(method=method, gaps=gaps, overlap=overlap, convention=convention)
     name = signal_name(log)
     signal = log[name] if axis is None else _pick(log[name], axis)
@@ -74,7 +74,7 @@ def choose_window(log: xr.Dataset) -> str:
 
     Examples
     --------
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> choose_window(make_log(np.zeros(8600), rate=100.0, unit="deg/h"))
     '20s'
     """

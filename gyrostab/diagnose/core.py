@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.convert import as_log
 from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
 from gyrostab.diagnose.calibration.known import known_motion, without_known_lines
 from gyrostab.diagnose.conclusion.account import unexpected
@@ -28,6 +27,7 @@ from gyrostab.diagnose.reduction.aligned import align_channels
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.task import Compared, Task, still_lines
 from gyrostab.errors import OptionError, SchemaError
+from gyrostab.ingest.convert import as_log
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 from gyrostab.simulate.model import Model, read_model

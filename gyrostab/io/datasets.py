@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.convert import as_log
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, reading_of
+from gyrostab.ingest.convert import as_log
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
 from gyrostab.store import (
     Misfit,
@@ -332,7 +332,7 @@ def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
     >>> import tempfile
     >>> from gyrostab.davar import davar
     >>> from gyrostab.fit import fit_noise
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     _ = to_netcdf(fit_noise(davar(log, window="60s")), folder + "/product.nc")
@@ -389,7 +389,7 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
     Examples
     --------
     >>> import tempfile
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     _ = to_netcdf(make_log([[1.0, np.nan, 2.0]], rate=100.0, unit="deg/h"), folder + "/log.nc")
     ...     with open_log(folder + "/log.nc") as log:

@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.convert import as_log
 from gyrostab.errors import OptionError
-from gyrostab.log import make_log
+from gyrostab.ingest.convert import as_log
+from gyrostab.ingest.make_log import make_log
 from gyrostab.plot.signal import thin
 from gyrostab.plot.style import COLOURS, GREY, label_log_axis, literal_text, new_figure, unit_label
 from gyrostab.plot.surface import CHANGE_CMAP

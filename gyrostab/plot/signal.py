@@ -9,8 +9,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.convert import as_log
 from gyrostab.errors import OptionError
+from gyrostab.ingest.convert import as_log
 from gyrostab.plot.style import axis_names, axis_style, literal_text, new_figure, shade_spans, stack_panels, time_axis, unit_label
 from gyrostab.schema import log_channels, signal_name
 

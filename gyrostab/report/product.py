@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.convert import as_log
+from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import duration, embedded
 from gyrostab.report.page import page_text

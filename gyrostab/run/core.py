@@ -63,9 +63,9 @@ def load_log(
         Keep the samples from the one up to, but not including, the other: dates and times (ISO 8601, UTC), or durations
         after the start of the log.
     exclude : sequence of str or pairs
-        Spans ``"START/END"`` of which the samples are taken as missing; see `gyrostab.uniform.cut_log`.
+        Spans ``"START/END"`` of which the samples are taken as missing; see `gyrostab.ingest.uniform.cut_log`.
     **reading
-        Options of `gyrostab.read.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``,
+        Options of `gyrostab.ingest.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``,
         ``strict``, ``limits``, ``on_file``.
 
     Returns
@@ -73,10 +73,10 @@ def load_log(
     xarray.Dataset
         Log of `gyrostab.schema`.
     """
-    from gyrostab.read import read_log
-    from gyrostab.regularise import regularise
-    from gyrostab.regularise.notes import describe_channels
-    from gyrostab.uniform import cut_log
+    from gyrostab.ingest import read_log
+    from gyrostab.ingest.grid.notes import describe_channels
+    from gyrostab.ingest.grid.regularise import regularise
+    from gyrostab.ingest.uniform import cut_log
 
     log = read_log(paths, max_gap=max_gap, **reading)
     if "sampling_rate_hz" not in log.attrs:
@@ -130,7 +130,7 @@ def run(
     output : path
         NetCDF file to be written.
     reading, windows, fitting : mapping
-        Options of `gyrostab.read.read_log`, `gyrostab.davar.davar` and `gyrostab.fit.fit_noise`.
+        Options of `gyrostab.ingest.read_log`, `gyrostab.davar.davar` and `gyrostab.fit.fit_noise`.
     surface_only : bool
         Write the dynamic Allan variance without fitting it.
     overwrite : bool
@@ -225,7 +225,7 @@ def _run_job(
 
 
 def _describe(paths: Sequence[str | Path], target: Path, options: dict[str, Any]) -> _Job:
-    from gyrostab.read.files import expand
+    from gyrostab.ingest.files import expand
 
     extra = options["reading"].get("channel", ())
     files = expand(paths) + (expand(extra) if extra else [])

@@ -14,9 +14,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.convert import as_log
 from gyrostab.errors import OptionError, SchemaError, UnitError
-from gyrostab.gaps import gap_variables
+from gyrostab.ingest.convert import as_log
+from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
 from gyrostab.schema import GAP_CAUSES, SIGNAL_UNITS, attributes, check_log, log_channels, signal_name

@@ -143,7 +143,7 @@ def foreign_netcdf(path: Path, form: str) -> None:
 
 def regular_log() -> Any:
 
-    from gyrostab.log import make_log
+    from gyrostab.ingest.make_log import make_log
 
     (x, _), temperature = signals()
     return make_log(x * 0.5, rate=RATE, unit="deg/h", channels={"temperature": (temperature, "degC")})

@@ -24,7 +24,7 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     logs
         One or more logs, in any format that gyrostab reads.
     """
-    from gyrostab.scan import examine, next_command, print_look, print_next, print_scan
+    from gyrostab.ingest.scan import examine, next_command, print_look, print_next, print_scan
 
     options = reading.given()
     examined = examine(logs, **options)

@@ -82,10 +82,10 @@ def correlate(
     """
     from gyrostab.correlate import correlate as compute
     from gyrostab.correlate import format_correlation, join
+    from gyrostab.ingest.channel import read_channel
     from gyrostab.io.datasets import open_product, to_netcdf
     from gyrostab.plot.correlation import plot_correlation
     from gyrostab.plot.style import save_png
-    from gyrostab.read.channel import read_channel
     from gyrostab.store.output import check_output, new_output
 
     given, file = other.options(), other.channel

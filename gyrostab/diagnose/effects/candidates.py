@@ -124,7 +124,7 @@ def effect_candidates(reduced: xr.Dataset, coefficient: xr.DataArray) -> tuple[l
     Examples
     --------
     >>> from gyrostab.diagnose.reduction.reduced import reduce_log
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> noise = 1.8 * np.random.default_rng(1).standard_normal((1, 60_000))
     >>> reduced = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
     >>> level = xr.DataArray([[0.003, 0.0]], {"axis": ["axis_0"], "term": ["N", "B"]}, ("axis", "term"))

@@ -46,7 +46,7 @@ def moving_blocks(reduced: xr.Dataset) -> NDArray[np.bool_]:
 
     Examples
     --------
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> rate = np.random.default_rng(1).standard_normal((2, 60_000))
     >>> rate[1, 20_000:30_000] += 500.0
     >>> moving_blocks(reduce_log(make_log(rate, rate=100.0, unit="deg/h"), block="5s")).sum(axis=1)

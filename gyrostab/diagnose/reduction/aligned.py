@@ -121,7 +121,7 @@ def align_channels(log: xr.Dataset) -> Aligned:
 
     Examples
     --------
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> log = make_log(np.zeros((1, 4)), rate=100.0, unit="deg/h", start="2026-01-01")
     >>> late = log["time"].values + np.timedelta64(3, "ms")
     >>> log = log.assign_coords(time_ramp=late).assign(ramp=("time_ramp", [0.0, 0.4, 0.8, 0.2], {"units": "1"}))

@@ -133,7 +133,7 @@ def reduce_log(
 
     Examples
     --------
-    >>> from gyrostab.log import make_log
+    >>> from gyrostab.ingest.make_log import make_log
     >>> noise = 0.18 * 10 * np.random.default_rng(1).standard_normal((1, 360_000))
     >>> reduced = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
     >>> reduced.sizes["block"], reduced.attrs["block_s"], float((reduced.power.mean() ** 0.5).round(2))

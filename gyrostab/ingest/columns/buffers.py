@@ -1,0 +1,127 @@
+"""Growing columns that move from memory to an unlinked temporary file when they become large."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.ingest.columns.pieces import Piece, Pieces, Spool, Stored, Words
+from gyrostab.store.direct import stack_rows, with_fill
+
+__all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "lazily", "pieces_of", "put", "take", "together"]
+
+#: Columns of one file together stay in memory up to this size [bytes].
+SPILL_BYTES = 128 * 2**20
+
+#: Rows of one dask chunk of a column in pieces.
+CHUNK_ROWS = 2**21
+
+#: Values of all columns of a file up to which they are put together to plain arrays.
+_SMALL = 2**21
+
+
+def take(column: NDArray[Any] | Pieces, rows: NDArray[np.int64]) -> NDArray[Any]:
+    """The values of a few rows."""
+    if isinstance(column, Pieces):
+        return np.concatenate([np.empty(0, column.dtype), *(column[row : row + 1] for row in rows.tolist())])
+    return np.asarray(column[rows])
+
+
+def put(column: NDArray[Any] | Pieces, rows: NDArray[np.int64], value: int) -> None:
+    """Change a few rows."""
+    if isinstance(column, Pieces):
+        for row in rows.tolist():
+            column.put(row, value)
+    else:
+        column[rows] = value
+
+
+class Buffers:
+    """Columns of 8-byte numbers that grow block by block.
+
+    Up to `limit` bytes they stay in memory; beyond it they are appended to a spool. Where they are few and in memory, they end as
+    arrays, of which the columns `rows_of` are the rows of one.
+    """
+
+    def __init__(self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES, rows_of: Sequence[Any] = ()):
+        self.rows_of = rows_of
+        self.dtypes = {key: np.dtype(dtype) for key, dtype in dtypes.items()}
+        self.limit = limit
+        self.rows = 0
+        self._pieces: dict[Any, list[Piece]] = {key: [] for key in dtypes}
+        self._spool: Spool | None = None
+        self._held = self._moved = 0  # bytes in memory; pieces of each column that were spilled
+
+    def add(self, block: Mapping[Any, NDArray[Any] | Piece]) -> None:
+        """Append one block: every column, all of one length."""
+        size = 0
+        for key, values in block.items():
+            piece = self._words(key, values) if isinstance(values, np.ndarray) else values
+            self._pieces[key].append(piece)
+            self._held += piece.held
+            size = piece.rows
+        self.rows += size
+        if self._spool or self._held > self.limit:
+            self._spill()
+
+    def _words(self, key: Any, values: NDArray[Any]) -> Piece:
+        whole = np.ascontiguousarray(values, dtype=self.dtypes[key])
+        if isinstance(whole.base, np.ndarray) and whole.base.nbytes > whole.nbytes:
+            whole = whole.copy()  # or else what it is a part of would stay in memory
+        return Words(whole.view(np.int64))
+
+    def _spill(self) -> None:
+        self._spool = spool = self._spool or Spool()
+        for pieces in self._pieces.values():
+            pieces[self._moved :] = [piece.spilled(spool) for piece in pieces[self._moved :]]
+        self._held, self._moved = 0, max(map(len, self._pieces.values()))
+
+    def finish(self) -> dict[Any, NDArray[Any] | Pieces]:
+        """The columns: arrays where they are small, or else in pieces."""
+        found: dict[Any, NDArray[Any] | Pieces] = {}
+        stays = any(isinstance(piece, Stored) for pieces in self._pieces.values() for piece in pieces)
+        small = not stays and self._spool is None and self.rows * len(self._pieces) <= _SMALL
+        matrix = np.empty((len(self.rows_of), self.rows if small else 0))
+        for key, pieces in self._pieces.items():
+            column = Pieces(self.dtypes[key], pieces)
+            pieces.clear()
+            if small:
+                plain = matrix[self.rows_of.index(key)] if key in self.rows_of else np.empty(self.rows, self.dtypes[key])
+                column.fill(0, 0, plain)
+                found[key] = plain
+            else:
+                found[key] = column
+        return found
+
+
+def together(columns: Sequence[Any]) -> Any:
+    """Columns as the rows of one array, numpy if they are, without a copy if they are the rows of one already."""
+    if not isinstance(columns[0], np.ndarray):
+        stacked = stack_rows(columns)
+        stacked.gyrostab_pieces = [pieces for column in columns for pieces in pieces_of(column)]
+        return stacked
+    whole = columns[0].base
+    same = whole is not None and whole.ndim == 2 and len(whole) == len(columns) and all(column.base is whole for column in columns)
+    return whole if same else np.stack(columns)
+
+
+def lazily(values: NDArray[Any] | Pieces) -> Any:
+    """A dask array over a column in pieces; an array in memory is returned as it is."""
+    if not isinstance(values, Pieces):
+        return values
+    import dask.array
+
+    name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
+    lazy = with_fill(dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta), values.fill)
+    lazy.gyrostab_pieces = [values]
+    lazy.gyrostab_line = values.find_line()
+    return lazy
+
+
+def pieces_of(array: Any) -> list[Pieces]:
+    """The columns in pieces that an array of `lazily` or `together` reads."""
+    return list(getattr(array, "gyrostab_pieces", ()))

@@ -1,0 +1,162 @@
+"""What header cells say: the name and unit of a column, and which names have a meaning here."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+from gyrostab.errors import GyrostabError, UnitError
+from gyrostab.ingest.columns.stamps import parse_time_unit
+from gyrostab.units import known_units, parse_unit
+
+__all__ = [
+    "AXIS", "KNOWN", "LOOKS_GYRO", "TIME", "Header", "distinct_columns", "example_unit", "free_name", "is_contract_name", "is_time_unit",
+    "is_unit", "is_unit_of", "quantity_of", "split_header", "unit_quantity",
+]  # fmt: skip
+
+_BRACKET = re.compile(r"^(.*?)\s*\[([^\[\]]*)\]\s*$")
+_PARENTHESES = re.compile(r"^(.*?)\s*\(([^()]*)\)\s*$")
+AXIS = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")
+_TIME_SUFFIX = r"s|sec|seconds?|ms|milliseconds?|us|microseconds?|ns|nanoseconds?|utc|iso"
+TIME = re.compile(rf"^(?:(?:time|timestamp|t)(?:[_ ]({_TIME_SUFFIX}))?|(?:time|timestamp)(sec|ms|us|ns|utc))$")
+LOOKS_GYRO = [re.compile(pattern, re.IGNORECASE) for pattern in (r"gyr|angular_?(rate|vel)|omega", r"^[gw]_?[xyz](_|$)|^w_rs", r"rate|rot")]
+
+#: Channel name, or the stem before an underscore -> quantity.
+QUANTITIES = {
+    "temperature": "temperature",
+    "vibration": "acceleration",
+    "accel": "acceleration",
+    "rotation_rate": "rotation_rate",
+    "supply_voltage": "voltage",
+    "light_power": "power",
+    "pressure": "pressure",
+    "mag": "magnetic",
+    "ramp": "number",
+}
+KNOWN = re.compile(r"^(temperature|vibration|rotation_rate|supply_voltage|light_power|pressure|ramp|accel_[xyz]|mag_[xyz])$")
+
+
+@dataclass
+class Header:
+    """A column while it is being understood."""
+
+    source: int
+    header: str
+    name: str
+    unit: str | None
+    stored: str | None = None  # the unit that the format keeps beside the header, weaker than --unit
+    calendar: str | None = None  # the CF calendar of that unit
+    mapped: bool = False  # by the user
+    preset: bool = False  # known from the program that wrote the file
+    stamped: bool = False
+    key: str = ""  # what --map may call it, to mean this column and no other
+
+    @property
+    def low(self) -> str:
+        """The name in small letters."""
+        return self.name.lower()
+
+
+def split_header(text: str) -> tuple[str, str | None]:
+    """Name and unit of a header cell.
+
+    A unit is in square brackets, or in parentheses if it is a known one. A whole number in brackets is an index and stays in the name.
+
+    Examples
+    --------
+    >>> split_header("gyro_x [deg/h]")
+    ('gyro_x', 'deg/h')
+    >>> split_header("gyro_rad[0]")
+    ('gyro_rad[0]', None)
+    >>> split_header("Gyroscope x (rad/s)"), split_header("Supply (raw)")
+    (('Gyroscope x', 'rad/s'), ('Supply (raw)', None))
+    """
+    match = _PARENTHESES.match(text.strip())
+    if match and match.group(1) and not match.group(2).strip().isdigit() and is_unit(match.group(2)):
+        return match.group(1).strip(), match.group(2).strip()
+    match = _BRACKET.match(text.strip())
+    if not match or (match.group(2).strip().isdigit() and match.group(2).strip() != "1"):
+        return text.strip(), None
+    if match.group(2).strip() == "1" and not re.search(r"\s\[", text):
+        return text.strip(), None  # "gyro_rad[1]" is an index, "ramp [1]" a unit
+    return match.group(1).strip(), match.group(2).strip()
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is a unit, of time or of anything else that `gyrostab.units` knows."""
+    for parse in (parse_unit, parse_time_unit):
+        try:
+            parse(text)
+        except GyrostabError:
+            continue
+        return bool(text.strip(" -"))
+    return False
+
+
+def is_unit_of(text: str, quantities: Collection[str]) -> bool:
+    """Whether a text is a unit of one of these quantities."""
+    for quantity in quantities:
+        try:
+            if parse_unit(text, quantity).quantity == quantity:
+                return True
+        except UnitError:
+            continue
+    return False
+
+
+def is_time_unit(text: str) -> bool:
+    """Whether a text is a unit of time."""
+    try:
+        parse_time_unit(text)
+    except GyrostabError:
+        return False
+    return True
+
+
+def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
+    """The columns, each with a key of its own: its name, or where that is not the only one its header, or a number behind it."""
+    split = [(header.strip(), *split_header(header)) for header in headers]
+    names = Counter(name.lower() for _, name, _ in split)
+    whole = Counter(header.lower() for header, _, _ in split)
+    taken: Collection[str] = whole.keys() | names.keys()
+    counts: Counter[str] = Counter()
+    for source, (header, name, unit) in enumerate(split):
+        key = name if names[name.lower()] == 1 else header
+        if whole[key.lower()] > 1:
+            counts[key.lower()] += 1
+            number = counts[key.lower()]
+            key = key if number == 1 else free_name(f"{name}_", taken, number)
+        yield Header(source, header, name, unit, key=key)
+
+
+def free_name(stem: str, taken: Collection[str], number: int = 2) -> str:
+    """The first name with a number behind it that is not taken."""
+    while f"{stem}{number}" in taken or f"{stem}{number}".lower() in taken:
+        number += 1
+    return f"{stem}{number}"
+
+
+def quantity_of(low: str) -> str | None:
+    """What a channel of this name measures."""
+    return (
+        QUANTITIES.get(low)
+        or QUANTITIES.get(low.split("_")[0])
+        or next((quantity for name, quantity in QUANTITIES.items() if low.startswith(name + "_")), None)
+    )
+
+
+def unit_quantity(quantity: str) -> str:
+    """The quantity whose units a channel may have."""
+    return "rate" if quantity == "rotation_rate" else quantity
+
+
+def example_unit(quantity: str | None) -> str:
+    """A unit for a message."""
+    return "1" if quantity is None else "deg/s" if quantity == "rotation_rate" else known_units(quantity).split(",")[0]
+
+
+def is_contract_name(low: str) -> bool:
+    """Whether a name in small letters is one that has a meaning of its own: an axis, the time or a known channel."""
+    return bool(AXIS.match(low) or KNOWN.match(low) or low == "time")

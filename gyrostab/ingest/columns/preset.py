@@ -1,0 +1,104 @@
+"""What columns are in the files of known programs: small TOML files in ``presets``, recognised by the header and the lines above it.
+
+A preset has a `name`, the `times` that may be the time column (the first that is filled is taken), and `columns`: what a column is, in
+the form of ``--map``, and how the program heads it. `above` and `file` are patterns for a line above the header and for the file's name,
+`needs` are headers that must be there too, `drops` are columns that are not kept, and `rate` finds the sampling rate [Hz] above the header.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Found", "find_preset", "preset_names"]
+
+_KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
+
+
+@dataclass(frozen=True)
+class Found:
+    """A preset that fits a file: column number -> what it is, and the sampling rate [Hz] where the file tells it."""
+
+    name: str
+    columns: dict[int, str] = field(default_factory=dict)
+    rate: float | None = None
+
+
+@cache
+def _presets() -> dict[str, dict[str, Any]]:
+    """The presets by the names of their files."""
+    found = {}
+    for place in sorted(files("gyrostab.ingest.columns").joinpath("presets").iterdir(), key=lambda place: place.name):
+        if place.name.endswith(".toml"):
+            preset = tomllib.loads(place.read_text(encoding="utf-8"))
+            assert set(preset) <= _KEYS, f"{place.name}: {set(preset) - _KEYS}"
+            found[place.name.removesuffix(".toml")] = preset
+    return found
+
+
+def preset_names() -> dict[str, str]:
+    """Name of each preset -> the program whose files it describes.
+
+    Examples
+    --------
+    >>> preset_names()["phyphox"]
+    'phyphox'
+    """
+    return {key: preset["name"] for key, preset in _presets().items()}
+
+
+def find_preset(
+    path: Path, headers: Sequence[tuple[str, str]], *, above: Sequence[str] = (), is_filled: Callable[[int], bool] | None = None
+) -> Found | None:
+    """Find the preset that fits a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for its name.
+    headers : sequence of (str, str)
+        Whole header and name without its unit of each column.
+    above : sequence of str
+        Lines above the header.
+    is_filled : callable, optional
+        Says of a column whether its first cells hold anything.
+
+    Returns
+    -------
+    Found or None
+        What the columns are, or None for the files of other programs.
+    """
+    places: dict[str, int] = {}
+    for place, names in reversed(list(enumerate(headers))):
+        for name in reversed(names):
+            places[name.strip().lower()] = place
+    for key, preset in _presets().items():
+        gyro = [names for target, names in preset["columns"].items() if target.startswith("gyro_")]
+        if not all(any(name.lower() in places for name in names) for names in [*gyro, *([name] for name in preset.get("needs", ()))]):
+            continue
+        if "file" in preset and not re.search(preset["file"], path.name, re.IGNORECASE):
+            continue
+        if "above" in preset and not any(re.search(preset["above"], line) for line in above):
+            continue
+        return _apply(f"{preset['name']} (preset {key})", preset, places, above, is_filled or (lambda place: True))
+    return None
+
+
+def _apply(name: str, preset: dict[str, Any], places: dict[str, int], above: Sequence[str], is_filled: Callable[[int], bool]) -> Found:
+    columns = {places[drop.lower()]: "-" for drop in preset.get("drops", ()) if drop.lower() in places}
+    times = [(places[time["column"].lower()], time["unit"]) for time in preset["times"] if time["column"].lower() in places]
+    filled = [(place, unit) for place, unit in times if is_filled(place)]
+    columns.update(dict.fromkeys([place for place, _ in times], "-"))
+    if filled:
+        columns[filled[0][0]] = f"time [{filled[0][1]}]"
+    for target, names in preset["columns"].items():
+        held = [places[name.lower()] for name in names if name.lower() in places]
+        columns.update(dict.fromkeys(held[:1], target))
+    rates = [found[1] for line in above if "rate" in preset and (found := re.search(preset["rate"], line))]
+    return Found(name, columns, float(rates[0]) if rates else None)

@@ -1,0 +1,329 @@
+"""From blocks of columns, as a format delivers them, to the raw log: units, counts of what is unreadable, labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.buffers import SPILL_BYTES, Buffers, lazily, put, take, together
+from gyrostab.ingest.columns.pieces import Counts, Piece, Pieces, Steps
+from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.store.seen import Seen, with_seen
+
+__all__ = ["Intake", "Taken", "summary_of"]
+
+#: How many bad places a note names.
+NAMED = 10
+#: A file with a larger share of unreadable rows is refused.
+MAX_UNREADABLE = 0.5
+
+Values = dict[int, NDArray[np.float64]]
+Locate = Callable[[Sequence[int]], list[str]]
+
+
+class Taken(NamedTuple):
+    """A block of rows as `Intake.add` takes it; rows are counted from its first.
+
+    Attributes
+    ----------
+    rows : int
+        Rows.
+    block : dict
+        Column number -> values in the inner unit, or a piece of the column.
+    ranges : dict
+        Column number -> values missing, range of the others as they stand in the file, whether these are whole numbers.
+    bad_rows, cell_rows : ndarray of int64
+        Rows that are unreadable, and others in which a gyro cell is.
+    bad_cells, cells : int
+        Cells that are unreadable, and gyro cells of `cell_rows`.
+    low, high : int
+        Range of the stamps of readable rows [ns since 1970]; the other way round where there are none.
+    seen : Seen or None
+        What a look at the values found, where they stay in the file.
+    """
+
+    rows: int
+    block: dict[int, NDArray[Any] | Piece]
+    ranges: dict[int, tuple[int, float, float, bool]]
+    bad_rows: NDArray[np.int64]
+    cell_rows: NDArray[np.int64]
+    bad_cells: int
+    cells: int
+    low: int
+    high: int
+    seen: Seen | None = None
+
+
+_NO_ROWS = np.empty(0, np.int64)
+
+
+def _not_finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return ~np.isfinite(values)
+
+
+def _row_names(first: int) -> Locate:
+    return lambda rows: [f"row {first + row}" for row in rows]
+
+
+class Intake:
+    """Collects the blocks of one file and makes the raw log of them.
+
+    Parameters
+    ----------
+    plan : Plan
+        What each column is.
+    options : ReadOptions
+        What the user said.
+    limit : int
+        Size [bytes] above which the columns move to disk.
+    """
+
+    def __init__(self, plan: Plan, options: ReadOptions, *, limit: int = SPILL_BYTES):
+        self.plan, self.options = plan, options
+        self.time = plan.time
+        self.gyro, self.channels = plan.of("gyro"), plan.of("channel")
+        dtypes: dict[int, Any] = {column.source: np.float64 for column in [*self.gyro, *self.channels]}
+        if self.time is not None:
+            dtypes[self.time.source] = np.int64
+        self.buffers = Buffers(dtypes, limit=limit, rows_of=[column.source for column in self.gyro])
+        self.tens = {column.source: 1.0 for column in [*self.gyro, *self.channels]}  # powers of ten that are tried; 0 for none
+        self.bad_rows = self.bad_cells = self.cells = self.cell_rows = 0
+        self.bad_places: list[str] = []
+        self.cell_places: list[str] = []
+        self.bad_index: list[NDArray[np.int64]] = []
+        self.low, self.high = np.iinfo(np.int64).max, NAT
+        self.seen: list[Seen] = []
+        self.whole: dict[int, tuple[float, float] | None] = {column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]}
+
+    def prepare(self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0) -> Taken:
+        """Convert one block, and pack what can be packed; several threads may do so side by side.
+
+        Parameters
+        ----------
+        values : dict of int to ndarray
+            Column number -> values in the file's unit, NaN where unreadable or empty. Changed in place.
+        stamps : ndarray of int64 or None
+            Stamps [ns since 1970], `NAT` where unreadable; None without a time column.
+        words : int
+            Cells of channels that hold something that is no number (empty ones are not filled, which is no fault).
+        """
+        from gyrostab.kernels.decimals import even_steps
+
+        size = len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
+        if size == 0:
+            return Taken(0, {}, {}, _NO_ROWS, _NO_ROWS, 0, 0, np.iinfo(np.int64).max, NAT)
+        bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
+        block: dict[int, NDArray[Any] | Piece] = {}
+        bad_cells, ranges, masks = words + int(np.count_nonzero(bad)), {}, []
+        for column in [*self.gyro, *self.channels]:
+            source = column.source
+            block[source], ranges[source] = self._convert(column, values[source])
+            unknown = np.isnan if block[source] is values[source] else _not_finite  # what is packed is not converted yet
+            masks.append(unknown(values[source]) if ranges[source][0] else None)
+        gyro = [mask for mask in masks[: len(self.gyro)] if mask is not None]
+        bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro)
+        if self.gyro and all(mask is not None for mask in masks):
+            bad = bad | np.logical_and.reduce([mask for mask in masks if mask is not None])
+        any_bad = bool(bad.any())
+        others = [mask & ~bad for mask in gyro]
+        low, high = np.iinfo(np.int64).max, NAT
+        if stamps is not None and self.time is not None:
+            good = stamps[~bad] if any_bad else stamps
+            if len(good):
+                low, high = int(good.min()), int(good.max())
+            table = even_steps(stamps)
+            block[self.time.source] = stamps if table is None else Steps(table, size)
+        return Taken(
+            size, block, ranges, np.flatnonzero(bad) if any_bad else _NO_ROWS,
+            np.flatnonzero(np.logical_or.reduce(others)) if others else _NO_ROWS,
+            bad_cells, sum(int(np.count_nonzero(mask)) for mask in others), low, high,
+        )  # fmt: skip
+
+    def add(self, taken: Taken, locate: Locate | None = None) -> None:
+        """Take one block.
+
+        Parameters
+        ----------
+        taken : Taken
+            From `prepare`.
+        locate : callable, optional
+            Row numbers within the block -> how a message calls them.
+        """
+        if taken.rows == 0:
+            return
+        locate = locate or _row_names(self.buffers.rows)
+        self.bad_cells += taken.bad_cells
+        for source, (missing, low, high, whole) in taken.ranges.items():
+            span = self.whole[source]
+            if span is not None and missing < taken.rows:
+                self.whole[source] = (min(span[0], low), max(span[1], high)) if whole else None
+        if taken.bad_rows.size:
+            self._note_rows(taken.bad_rows, locate)
+        if taken.cell_rows.size:
+            self._note_cells(taken.cell_rows, taken.cells, locate)
+        self.low, self.high = min(self.low, taken.low), max(self.high, taken.high)
+        self.seen += [taken.seen] if taken.seen is not None else []
+        self.buffers.add(taken.block)
+
+    def _convert(self, column: Column, values: NDArray[np.float64]) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
+        """Convert to the inner unit, in place or packed, infinities to NaN; and what `Taken.ranges` tells of the column."""
+        from gyrostab.kernels.decimals import decimals_of, to_decimals
+        from gyrostab.kernels.rows import clean_column
+
+        tens = self.tens[column.source]
+        for _ in range(2):
+            counts = np.empty(values.size if tens else 0, np.int32)
+            if tens:
+                fits, *found = to_decimals(values, tens, counts)
+                if fits:
+                    self.tens[column.source] = tens
+                    return Counts(counts, tens, column.factor, column.offset), (found[0], found[1], found[2], found[3])
+            tens = decimals_of(values) if tens else 0.0
+        self.tens[column.source] = 0.0  # no decimals: the next blocks are not tried
+        missing, low, high, whole = clean_column(values, column.factor, column.offset)
+        return values, (missing, low, high, whole)
+
+    def _packing(self, columns: Sequence[Column]) -> dict[str, Any]:
+        """The encoding of columns of whole numbers that have one factor; none for others."""
+        spans = [self.whole[column.source] for column in columns]
+        factors = {column.factor for column in columns if column.offset == 0.0}
+        if None in spans or len(factors) != 1 or any(column.offset != 0.0 for column in columns):
+            return {}
+        reach = max(max(-low, high) for low, high in filter(None, spans))
+        dtype = next((kind for kind in ("int16", "int32") if reach < np.iinfo(kind).max), None)
+        return {"dtype": np.dtype(dtype), "scale_factor": factors.pop()} if dtype else {}
+
+    def _note_rows(self, rows: NDArray[np.int64], locate: Locate) -> None:
+        self.bad_rows += len(rows)
+        self.bad_index.append(rows + self.buffers.rows)
+        if len(self.bad_places) < NAMED:
+            self.bad_places += locate([int(row) for row in rows[: NAMED - len(self.bad_places)]])
+
+    def _note_cells(self, rows: NDArray[np.int64], cells: int, locate: Locate) -> None:
+        self.cells += cells
+        self.cell_rows += len(rows)
+        if len(self.cell_places) < NAMED:
+            self.cell_places += locate([int(row) for row in rows[: NAMED - len(self.cell_places)]])
+
+    def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
+        """The raw log.
+
+        Raises
+        ------
+        FormatError
+            When there is no row, or more than half of them are unreadable.
+        """
+        name, rows = self.plan.path.name, self.buffers.rows
+        if rows == 0:
+            raise FormatError(f"{name}: there is a header but no data row below it; copy it again, or look at what the logger wrote")
+        if self.bad_rows > MAX_UNREADABLE * rows:
+            share, first = self.bad_rows / rows, self.bad_places[0]
+            what = "the separator, the columns that --map names and the unit of time (stamps lie in the years 1678 to 2262)"
+            raise FormatError(f"{name}: {share:.0%} of {rows} rows are unreadable, the first is {first}; look at it, and check {what}")
+        columns = self.buffers.finish()
+        stamps = self._stamps(columns)
+        dataset = self._dataset({key: lazily(column) for key, column in columns.items()}, stamps)
+        dataset.attrs.update(
+            source_files=[name],
+            row_start=[0],
+            notes=[f"{name}: {note}" for note in [*self.plan.notes, *notes, *self._faults(rows)]],
+            unreadable_rows=self.bad_rows,
+            unreadable_cells=self.bad_cells,
+            unmatched_options=list(self.plan.unmatched),
+            headers=[summary.header for summary in self.plan.summaries],
+        )
+        return dataset
+
+    def _stamps(self, columns: dict[int, NDArray[Any] | Pieces]) -> Any:
+        if self.time is None:
+            return None
+        stamps = columns.pop(self.time.source)
+        if self.bad_index and self.low <= self.high:
+            rows = np.concatenate(self.bad_index)
+            written = take(stamps, rows)
+            put(stamps, rows[(written < self.low) | (written > self.high)], NAT)  # scratch numbers in a junk row are no stamp
+        return lazily(stamps.view("datetime64[ns]"))
+
+    def _dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:
+        data: dict[str, Any] = {}
+        coords: dict[str, Any] = {}
+        if self.gyro and self.plan.signal is not None:
+            axes = [column.name for column in self.gyro]
+            stack = together([columns[column.source] for column in self.gyro])
+            stack = with_seen(stack, self.seen) if self.seen else stack
+            data[self.plan.signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[self.plan.signal]}, self._packing(self.gyro))
+            coords["axis"] = np.array(axes, dtype=str)
+        for column in self.channels:
+            data[column.name] = ("row", columns[column.source], {"units": column.units}, self._packing([column]))
+        if stamps is not None:
+            coords["time"] = ("row", stamps)
+        dataset = xr.Dataset(data, coords=coords, attrs={"kind": self.plan.kind} if self.plan.kind else {})
+        if self.options.rate is not None:
+            dataset.attrs["declared_rate_hz"] = float(self.options.rate)
+        if self.options.start is not None and stamps is None:
+            dataset.attrs["start"] = self.options.start
+        return dataset
+
+    def _faults(self, rows: int) -> list[str]:
+        notes = []
+        if self.bad_rows:
+            notes.append(f"{self.bad_rows} of {rows} rows are unreadable: {_places(self.bad_places, self.bad_rows)}")
+        if self.cell_places:
+            where = _places(self.cell_places, self.cell_rows)
+            notes.append(f"{self.cells} gyro cells hold no number in rows that are readable otherwise: {where}")
+        if self.options.start is not None and self.time is not None:
+            notes.append("--start is not used: the file has its own time column")
+        return notes
+
+
+def _places(places: Sequence[str], total: int) -> str:
+    """Bad places in a row: ``lines 7, 8, 9 and others``."""
+    kind = places[0].split(" ")[0]
+    numbers = ", ".join(place.removeprefix(f"{kind} ") for place in places)
+    return f"{kind}{'s' * (len(places) > 1)} {numbers}{' and others' * (total > len(places))}"
+
+
+def summary_of(
+    plan: Plan,
+    form: str,
+    rows: int | None,
+    *,
+    head: Sequence[int] | NDArray[np.int64] = (),
+    tail: Sequence[int] | NDArray[np.int64] = (),
+    notes: Sequence[str] = (),
+) -> FileSummary:
+    """What a cheap look tells of a file.
+
+    Parameters
+    ----------
+    plan : Plan
+        What each column is, and what stands in the way of reading.
+    form : str
+        Name of the format.
+    rows : int or None
+        Number of rows, where it is known.
+    head, tail : sequence of int
+        Stamps at the two ends [ns since 1970], `NAT` where unreadable.
+    notes : sequence of str
+        What the reader says.
+    """
+    first, last = (next((np.datetime64(int(stamp), "ns") for stamp in end if stamp != NAT), None) for end in (head, tail[::-1]))
+    return FileSummary(
+        path=plan.path,
+        format=form,
+        columns=plan.summaries,
+        axes=tuple(column.name for column in plan.of("gyro")),
+        channels=tuple(column.name for column in plan.of("channel")),
+        first=first,
+        last=last,
+        n_rows=rows,
+        notes=(*(f"{plan.path.name}: {note}" for note in [*notes, *plan.notes]), *(str(problem) for problem in plan.problems)),
+    )

@@ -1,0 +1,177 @@
+"""What the formats of typed columns share: batches of rows, numbers of any type to float64, stamps to nanoseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.pieces import Steps, Stored
+from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.raw_log import Intake, Taken, summary_of
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, dates_to_ns, floats_to_ns, integers_to_ns, looks_iso, signed_counts
+from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.store.seen import look_at_cells
+from gyrostab.store.threads import in_order
+
+__all__ = ["Fetch", "batch_rows", "convert_batch", "holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
+
+#: Rows and bytes of all columns that are taken at one time, at most.
+BATCH_ROWS = 2**20
+BATCH_BYTES = 2**26
+ENDS = 64
+
+#: Column number, first row, row after the last one -> values.
+Fetch = Callable[[int, int, int], Any]
+
+
+def to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
+    """Values as a new float64 array with NaN for what is missing, and how many cells hold something that is no number."""
+    if np.ma.isMaskedArray(values):
+        mask = np.ma.getmaskarray(values)
+        plain, words = to_floats(np.ma.getdata(values))
+        plain[mask] = np.nan
+        return plain, words
+    array = np.asarray(values)
+    if array.dtype.kind in "biuf":
+        with np.errstate(invalid="ignore"):  # damaged bytes may be a signalling NaN
+            return array.astype(np.float64), 0
+    out = np.full(array.shape, np.nan)
+    words = 0
+    for index, value in enumerate(array.ravel()):
+        try:
+            out[index] = float(value) if value is not None else np.nan
+        except (TypeError, ValueError):
+            words += bool(str(value).strip())
+    return out, words
+
+
+def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.int64]:
+    """Stamps [ns since 1970] of a column of dates, numbers or text."""
+    mask = np.ma.getmaskarray(values) if np.ma.isMaskedArray(values) else None
+    array = np.ma.getdata(values) if mask is not None else np.asarray(values)
+    unit = column.time_unit
+    if array.dtype.kind == "M":
+        stamps = dates_to_ns(array)
+    elif unit is None or array.dtype.kind not in "iuf":
+        stamps = cells_to_ns(["" if value is None else str(value) for value in array], unit, options.epoch_ns)
+    elif array.dtype.kind == "f":
+        stamps = floats_to_ns(array, unit, options.epoch_ns)
+    else:
+        stamps = integers_to_ns(signed_counts(array), unit, options.epoch_ns)
+    return stamps if mask is None else np.where(mask, NAT, stamps)
+
+
+def holds_dates(values: Any) -> bool:
+    """Whether a sample of a column is dates, or text that looks like dates."""
+    array = np.asarray(values)
+    return array.dtype.kind == "M" or (array.dtype.kind in "OUST" and any(isinstance(v, str) and looks_iso(v) for v in array[:50]))
+
+
+def read_columns(
+    plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, *, notes: Sequence[str] = (), limit: int = SPILL_BYTES, lasting: bool = False
+) -> xr.Dataset:
+    """Make the raw log of columns that can be fetched by ranges of rows.
+
+    Parameters
+    ----------
+    plan : Plan
+        What each column is.
+    options : ReadOptions
+        What the user said.
+    rows : int
+        Number of rows.
+    fetch : callable
+        Column number, first row, row after the last one -> values.
+    notes : sequence of str
+        Notes of the reader.
+    limit : int
+        Size [bytes] above which the columns are not held in memory.
+    lasting : bool
+        Several threads may call `fetch`, and at any later time: then values above the limit stay in the file.
+    """
+    intake = Intake(plan.check(), options, limit=limit)
+    stay = lasting and 8 * rows * len(plan.columns) > limit
+    if stay:
+        intake.tens = dict.fromkeys(intake.tens, 0.0)  # nothing is packed
+    step = batch_rows(len(plan.columns))
+    spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
+    take = partial(_take_rows, intake, plan, options, fetch, stay)
+    for taken in in_order(take, spans) if lasting else map(take, spans):
+        intake.add(taken)
+    return intake.finish(notes)
+
+
+def batch_rows(columns: int) -> int:
+    """Return how many rows are taken at one time.
+
+    Examples
+    --------
+    >>> batch_rows(4), batch_rows(1000)
+    (1048576, 8384)
+    """
+    return min(max(BATCH_BYTES // (8 * max(columns, 1)), 2**10), BATCH_ROWS) // 8 * 8
+
+
+def _take_rows(intake: Intake, plan: Plan, options: ReadOptions, fetch: Fetch, stay: bool, span: tuple[int, int]) -> Taken:
+    """Convert one batch; where the values stay in the file, only what was found in them is kept."""
+    taken = convert_batch(intake, options, {column.source: fetch(column.source, *span) for column in plan.columns})
+    if not stay:
+        return taken
+    begin, rows = span[0], taken.rows
+    seen = None
+    if intake.gyro:
+        cells = np.stack([cast(NDArray[np.float64], taken.block[column.source]) for column in intake.gyro])
+        seen = look_at_cells(cells, {column.name: cast(NDArray[Any], taken.block[column.source]) for column in intake.channels}, begin)
+    block: dict[int, Any] = {}
+    for column in plan.columns:
+        piece = taken.block[column.source]
+        read = partial(_read_stamps if column.role == "time" else _read_values, column, options, fetch)
+        block[column.source] = piece if isinstance(piece, Steps) else Stored(read, begin, rows)
+    return taken._replace(block=block, seen=seen)
+
+
+def _read_values(column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int) -> NDArray[np.float64]:
+    from gyrostab.kernels.rows import clean_column
+
+    values, _ = to_floats(fetch(column.source, start, stop))
+    clean_column(values, column.factor, column.offset)
+    return values
+
+
+def _read_stamps(column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int) -> NDArray[np.int64]:
+    return to_stamps(fetch(column.source, start, stop), column, options)
+
+
+def convert_batch(intake: Intake, options: ReadOptions, batch: dict[int, Any]) -> Taken:
+    """Convert one batch of columns for the intake."""
+    values, words = {}, 0
+    for column in [*intake.gyro, *intake.channels]:
+        values[column.source], odd = to_floats(batch[column.source])
+        words += odd if column.role == "channel" else 0
+    stamps = None if intake.time is None else to_stamps(batch[intake.time.source], intake.time, options)
+    return intake.prepare(values, stamps, words=words)
+
+
+def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:
+    """A warning when the stamps are stored with 24 bits only."""
+    time = plan.time
+    if time is None or str(dtypes[time.source]) not in ("float32", "float", ">f4", "<f4"):
+        return []
+    return [
+        f"the stamps in {time.header!r} are stored as float32, which keeps 7 digits; expect jitter, or store them as float64 or integers"
+    ]
+
+
+def summarise(form: str, plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, notes: Sequence[str] = ()) -> FileSummary:
+    """A summary with the first and last stamps fetched from the two ends."""
+    time = plan.time
+    if time is None or not rows:
+        return summary_of(plan, form, rows, notes=notes)
+    head, tail = (to_stamps(fetch(time.source, *span), time, options) for span in ((0, min(ENDS, rows)), (max(0, rows - ENDS), rows)))
+    return summary_of(plan, form, rows, head=head, tail=tail, notes=notes)

@@ -1,0 +1,254 @@
+"""Several files to one raw log: order, union of axes and channels, channels from other files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
+from gyrostab.ingest.columns.buffers import CHUNK_ROWS, lazily, pieces_of
+from gyrostab.ingest.columns.pieces import Blank, Pieces, Spool
+from gyrostab.ingest.concat import group_axes, some, split_axes, together
+from gyrostab.ingest.overlap import drop_repeats, stamp_span
+from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.store import common_packing
+from gyrostab.store.direct import end_to_end, one_row, stack_rows
+
+__all__ = ["attach_channels", "concatenate", "memory", "to_disk", "with_channels"]
+
+
+def memory(part: xr.Dataset) -> int:
+    """Bytes of the columns of a raw log that are held in memory."""
+    arrays = sum(variable.nbytes for variable in part.variables.values() if isinstance(variable._data, np.ndarray))
+    return arrays + sum(pieces.held for pieces in _pieces(part))
+
+
+def _pieces(part: xr.Dataset) -> list[Pieces]:
+    return [pieces for variable in part.variables.values() for pieces in pieces_of(variable._data)]
+
+
+def to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
+    """The same raw log with its columns in a temporary file."""
+
+    def moved(variable: xr.Variable) -> Any:
+        values = variable.values
+        return lazily(spool.store(values)) if values.ndim == 1 else stack_rows([lazily(spool.store(row)) for row in values])
+
+    for pieces in _pieces(part):
+        pieces.spill(spool)
+    long = {name: variable for name, variable in part.variables.items() if name != "axis" and isinstance(variable._data, np.ndarray)}
+    return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
+
+
+def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Join the raw logs of several files along ``row``, in the order of their first stamps; rows that two files hold count once.
+
+    Raises
+    ------
+    TimeError
+        When some files have stamps and others have none.
+    UnitError
+        When files hold different kinds of signal, or a channel changes its unit.
+    FormatError
+        When there is one row only.
+    """
+    if len(parts) == 1:
+        joined = parts[0]
+    else:
+        whole = _in_order([group for part in parts for group in split_axes(part)])
+        signal = _signal(whole)
+        own = [_off_rows(part) for part in whole]
+        ordered = [part.drop_vars([*names, *(f"time_{name}" for name in names)]) for part, names in zip(whole, own, strict=True)]
+        groups = _group_by_axes(ordered)
+        if "time" in ordered[0].variables:
+            groups = [drop_repeats(group) for group in groups]
+        joined = _join([part for group in groups for part in group], signal, groups)
+        apart = [part[names] for part, names in zip(whole, own, strict=True) if names]
+        joined = with_channels(joined, apart)
+    if joined.sizes["row"] < 2:
+        name = joined.attrs["source_files"][0]
+        raise FormatError(f"{name}: there is one row of data only; a log needs two at least")
+    return joined
+
+
+def _off_rows(part: xr.Dataset) -> list[str]:
+    """Channels that have a time of their own."""
+    return [str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)]
+
+
+def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
+    """Put files that have no axis in common, but the same time, into groups of their own; otherwise all are one group."""
+    groups = [[parts[number] for number in group] for group in group_axes([_axes(part) for part in parts])]
+    if len(groups) == 1 or not all(_axes(group[0]) for group in groups):
+        return [list(parts)]
+    if "time" not in parts[0].variables:
+        return groups
+    spans = [[stamp_span(part) for part in group] for group in groups]
+    ends = sorted((min(first for first, _ in span), max(last for _, last in span)) for span in spans)
+    in_time = [later[0] > earlier[1] for earlier, later in pairwise(ends)]  # one begins after the other has ended
+    return [list(parts)] if any(in_time) else groups
+
+
+def _axes(part: xr.Dataset) -> list[str]:
+    return [str(axis) for axis in part["axis"].values] if "axis" in part.coords else []
+
+
+def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+    timed = ["time" in part.variables for part in parts]
+    if not any(timed):
+        return list(parts)
+    if not all(timed):
+        with_time, without = (
+            next(p.attrs["source_files"][0] for p, t in zip(parts, timed, strict=True) if t is want) for want in (True, False)
+        )
+        raise TimeError(f"{with_time} has time stamps and {without} has none; read them one by one, or give the latter a time column")
+    return sorted(parts, key=_first_stamp)
+
+
+def _first_stamp(part: xr.Dataset) -> int:
+    for start in range(0, part.sizes["row"], 2**16):
+        stamps = part["time"][start : start + 2**16].values
+        good = stamps[~np.isnat(stamps)]
+        if len(good):
+            return int(good[0].astype("datetime64[ns]").view(np.int64))
+    return int(np.iinfo(np.int64).max)
+
+
+def _signal(parts: Sequence[xr.Dataset]) -> str | None:
+    first = parts[0]
+    for part in parts[1:]:
+        if part.attrs.get("kind") != first.attrs.get("kind"):
+            (a, b), (kind_a, kind_b) = zip(*((p.attrs["source_files"][0], p.attrs.get("kind")) for p in (first, part)), strict=True)
+            raise UnitError(f"{a} holds a gyro signal of kind {kind_a!r}, {b} of kind {kind_b!r}; read them one by one")
+    return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
+
+
+def _join(parts: list[xr.Dataset], signal: str | None, groups: list[list[xr.Dataset]]) -> xr.Dataset:
+    sizes = [part.sizes["row"] for part in parts]
+    names = [part.attrs["source_files"][0] for part in parts]
+    absent: dict[str, list[str]] = {}
+    data: dict[str, Any] = {}
+    coords: dict[str, Any] = {}
+    if "time" in parts[0].variables:
+        coords["time"] = ("row", end_to_end([part["time"].data for part in parts], CHUNK_ROWS))
+    if signal is not None:
+        axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
+        stack = _stacked(parts, signal, axes)
+        for axis in axes:
+            absent[f"axis {axis}"] = _lacking(groups, lambda part, axis=axis: axis in _axes(part))  # type: ignore[misc]
+        packing = common_packing(part[signal].encoding for part in parts)
+        data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]}, packing)
+        coords["axis"] = np.array(axes, dtype=str)
+    for channel in dict.fromkeys(str(name) for part in parts for name in part.data_vars if name != signal):
+        units = _channel_units(parts, channel)
+        columns = [part[channel].data if channel in part else np.full(size, np.nan) for part, size in zip(parts, sizes, strict=True)]
+        packing = common_packing(part[channel].encoding for part in parts if channel in part)
+        data[channel] = ("row", end_to_end(columns, CHUNK_ROWS), {"units": units}, packing)
+        absent[f"channel {channel}"] = _lacking(groups, lambda part, name=channel: name in part)  # type: ignore[misc]
+    joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
+    gaps = [f"{what} is not in {some(files)} and is missing there" for what, files in absent.items() if files]
+    joined.attrs.update(
+        source_files=names,
+        row_start=[int(start) for start in np.cumsum([0, *sizes[:-1]])],
+        notes=[*together((part.attrs["source_files"][0], part.attrs["notes"]) for part in parts), *gaps],
+        unreadable_rows=sum(part.attrs["unreadable_rows"] for part in parts),
+        unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
+    )
+    if len(groups) > 1:
+        ends = np.cumsum([0, *(sum(part.sizes["row"] for part in group) for group in groups)]).tolist()
+        axes_of = [sorted({axis for part in group for axis in _axes(part)}) for group in groups]
+        joined.attrs["axis_rows"] = [[axes, *rows] for axes, rows in zip(axes_of, pairwise(ends), strict=True)]
+    return joined
+
+
+def _lacking(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], bool]) -> list[str]:
+    """Name the files that lack something which others of their group have; those of other groups hold other axes."""
+    found = [(str(part.attrs["source_files"][0]), has(part)) for group in groups if any(map(has, group)) for part in group]
+    return [name for name, is_there in found if not is_there]
+
+
+def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
+    """The signal of all parts, (axis, row); NaN where a part lacks an axis."""
+    if all(isinstance(part[signal].data, np.ndarray) for part in parts):
+        whole = np.full((len(axes), sum(part.sizes["row"] for part in parts)), np.nan)
+        end = 0
+        for part in parts:
+            end += part.sizes["row"]
+            for axis in map(str, part["axis"].values):
+                whole[axes.index(axis), end - part.sizes["row"] : end] = part[signal].sel(axis=axis).data
+        return whole
+    return stack_rows([end_to_end([_axis(part, signal, axis) for part in parts], CHUNK_ROWS) for axis in axes])
+
+
+def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
+    if axis in part["axis"].values:
+        return one_row(part[signal].data, [str(name) for name in part["axis"].values].index(axis))
+    return lazily(Pieces(np.float64, [Blank(part.sizes["row"])]))
+
+
+def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
+    holders = [part for part in parts if channel in part]
+    units = {str(part[channel].attrs["units"]): part.attrs["source_files"][0] for part in reversed(holders)}
+    if len(units) > 1:
+        listed = ", ".join(f"{unit!r} in {name}" for unit, name in units.items())
+        raise UnitError(
+            f"channel {channel!r} has different units: {listed}; give one with --unit {channel}=UNIT or drop it with --map {channel}=-"
+        )
+    return next(iter(units))
+
+
+def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Add the channels of other tables of the same files, each on its own ``time_<channel>``; the log's attributes stay as they are."""
+    return attach_channels(log, sources).drop_attrs(deep=False).assign_attrs(log.attrs) if sources else log
+
+
+def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Add the channels of other files, each on its own ``time_<channel>`` with values only where present.
+
+    Raises
+    ------
+    OptionError
+        When a channel is in the log already, or a file holds no channel or no stamps.
+    """
+    pieces: dict[str, list[tuple[NDArray[Any], NDArray[Any], str]]] = {}
+    files: list[str] = []
+    for source in sources:
+        name = source.attrs["source_files"][0]
+        files.append(name)
+        for channel, stamps, values, units in _channels(source, name):
+            if channel in log.variables:
+                fix = f"rename it with --map {channel}={channel}_2 or drop it with --map {channel}=-"
+                raise OptionError(f"channel {channel!r} of {name} is in the log too; {fix}")
+            pieces.setdefault(channel, []).append((stamps, values, units))
+    for channel, found in pieces.items():
+        if len({units for _, _, units in found}) > 1:
+            raise UnitError(f"channel {channel!r} has different units in {some(files)}; give one with --unit {channel}=UNIT")
+        stamps, values = (np.concatenate([piece[place] for piece in found]) for place in (0, 1))
+        order = np.argsort(stamps, kind="stable")
+        dim = f"time_{channel}"
+        log = log.assign_coords({dim: (dim, stamps[order])}).assign({channel: (dim, values[order], {"units": found[0][2]})})
+    if files:
+        notes = [note for source in sources for note in source.attrs.get("notes", [])]
+        log = log.assign_attrs(notes=[*log.attrs.get("notes", []), *notes], channel_files=files)
+    return log
+
+
+def _channels(source: xr.Dataset, name: str) -> list[tuple[str, NDArray[Any], NDArray[Any], str]]:
+    found = []
+    for channel, variable in source.data_vars.items():
+        dim = f"time_{channel}" if f"time_{channel}" in source.variables else "time"
+        if len(variable.dims) != 1 or channel in SIGNAL_UNITS or str(variable.dims[0]) not in ("row", "time", dim):
+            continue
+        if dim not in source.variables:
+            raise OptionError(f"--channel {name}: it has no time column, so its rows cannot be placed; add one, or --map NAME=time")
+        stamps, values = np.asarray(source[dim].values), np.asarray(variable.values)
+        filled = np.isfinite(values) & ~np.isnat(stamps)
+        found.append((str(channel), stamps[filled], values[filled], str(variable.attrs.get("units", "1"))))
+    if not found:
+        raise OptionError(f"--channel {name}: it holds no channel with a unit; give one with --unit NAME=UNIT")
+    return found

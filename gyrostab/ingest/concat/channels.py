@@ -1,0 +1,152 @@
+"""The channels of several logs as one: on the common grid, or on their own stamps, each value once."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.errors import UnitError
+from gyrostab.ingest.concat.grid import Piece
+from gyrostab.ingest.concat.lazy import Part, fill_parts, lay
+from gyrostab.schema import log_channels
+from gyrostab.store.direct import can_fill, with_fill
+from gyrostab.time.grid import grid_index, grid_times
+
+__all__ = ["join_channels"]
+
+_SAME_STAMP = 0.75  # of a sampling period: the stamps of two copies differ by the rounding of each to its own grid
+_CUTS = 16  # slices for each log up to which values stay lazy
+
+
+def join_channels(pieces: Sequence[Piece], start: int, rate: float, size: int, chunk: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Join the channels of logs that lie on one grid.
+
+    Returns
+    -------
+    variables, coordinates : dict
+        Channels, NaN where a log has none, and the stamps ``time_<channel>`` of those that have their own.
+
+    Raises
+    ------
+    UnitError
+        When a channel has different units.
+    """
+    variables: dict[str, Any] = {}
+    coordinates: dict[str, Any] = {}
+    for name in dict.fromkeys(name for piece in pieces for name in log_channels(piece.source.log)):
+        holders = [piece for piece in pieces if name in piece.source.log]
+        attributes = _attributes(holders, name)
+        if all(piece.source.log.variables[name].dims != ("time",) for piece in holders):
+            stamps, values = _own_time(holders, name, start, rate)
+            variables[name] = (f"time_{name}", values, attributes)
+            coordinates[f"time_{name}"] = stamps.view("datetime64[ns]")
+        else:
+            variables[name] = ("time", lay([[_on_time(piece, name, start, rate) for piece in holders]], size, chunk, flat=True), attributes)
+    return variables, coordinates
+
+
+def _attributes(holders: Sequence[Piece], name: str) -> dict[str, Any]:
+    units = {str(piece.source.log.variables[name].attrs.get("units", "1")): piece.source.name for piece in reversed(holders)}
+    if len(units) > 1:
+        listed = ", ".join(f"{unit!r} in {file}" for unit, file in units.items())
+        raise UnitError(
+            f"channel {name!r} has different units: {listed}; ingest one of them anew with --unit {name}=UNIT or --map {name}=-"
+        )
+    return dict(holders[0].source.log[name].attrs)
+
+
+def _on_time(piece: Piece, name: str, start: int, rate: float) -> Part:
+    """A channel on the time of its log; one that has its own stamps, which other logs have not, at the samples nearest to them."""
+    channel = piece.source.log[name]
+    if channel.dims == ("time",):
+        return channel.data, None, piece.runs
+    import dask
+    import dask.array as da
+
+    stamps = _stamps(piece, name, start, rate)
+    sample = np.rint(grid_index(start, rate, stamps)).astype(np.int64)
+    inside = (sample >= piece.first) & (sample < piece.end)
+    spread = dask.delayed(_spread, pure=False)(channel.data, sample - piece.first, inside, piece.end - piece.first)
+    whole = da.from_delayed(spread, (piece.end - piece.first,), dtype=np.float64)
+    return whole, None, np.array([[piece.first, 0, piece.end - piece.first]], dtype=np.int64)
+
+
+def _spread(values: NDArray[Any], at: NDArray[np.int64], inside: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
+    out = np.full(size, np.nan)
+    out[at[inside]] = np.asarray(values)[inside]
+    return out
+
+
+def _stamps(piece: Piece, name: str, start: int, rate: float) -> NDArray[np.int64]:
+    """Stamps of a channel [ns since 1970], moved with its log where that stands after a step of the clock."""
+    stamps = piece.source.log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
+    moved = int(grid_times(start, rate, piece.first)) - piece.source.start
+    return np.asarray(stamps + moved if abs(moved) > 1e9 / rate else stamps)
+
+
+def _own_time(holders: Sequence[Piece], name: str, start: int, rate: float) -> tuple[NDArray[np.int64], Any]:
+    """Stamps and values in the order of time; of values that two logs have, those of the earlier log."""
+    near = int(_SAME_STAMP * 1e9 / rate)
+    done: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []  # stamps and places among all values, in the order of time
+    arrays, offset = [], 0
+    for piece in holders:
+        values = piece.source.log.variables[name].data
+        stamps, places = _stamps(piece, name, start, rate), np.arange(len(values)) + offset
+        arrays.append(values)
+        offset += len(values)
+        touched: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+        while len(stamps) and done and done[-1][0][-1] >= stamps[0] - near:
+            touched.insert(0, done.pop())
+        if touched:
+            held, held_places = (np.concatenate(column) for column in zip(*touched, strict=True))
+            cut = np.searchsorted(held, stamps[0] - near)
+            after = np.searchsorted(held, stamps)
+            following, before = held[np.minimum(after, len(held) - 1)], held[np.maximum(after - 1, 0)]
+            new = np.minimum(np.abs(following - stamps), np.abs(stamps - before)) > near
+            if cut:
+                done.append((held[:cut], held_places[:cut]))
+            stamps, places = np.concatenate([held[cut:], stamps[new]]), np.concatenate([held_places[cut:], places[new]])
+            order = np.argsort(stamps, kind="stable")
+            stamps, places = stamps[order], places[order]
+        if len(stamps):
+            done.append((stamps, places))
+    if not done:
+        return np.empty(0, dtype=np.int64), np.empty(0)
+    stamps, places = (np.concatenate(column) for column in zip(*done, strict=True))
+    done.clear()  # of channels of many days a copy less
+    return stamps, _taken(arrays, places)
+
+
+def _taken(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
+    """The values at `places`, in slices; in memory when that would be very many slices, or when all are there already."""
+    if all(isinstance(array, np.ndarray) for array in arrays):
+        return np.concatenate(arrays)[places]
+    import dask.array as da
+
+    whole = da.concatenate([da.asarray(array) for array in arrays])
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(places) != 1) + 1, [len(places)]])
+    if len(edges) > _CUTS * (len(arrays) + 1):
+        return np.asarray(whole)[places]
+    taken = da.concatenate([whole[places[a] : places[b - 1] + 1] for a, b in pairwise(edges)])
+    return with_fill(taken, partial(fill_parts, [_parts(arrays, places)])) if all(map(can_fill, arrays)) else taken
+
+
+def _parts(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[Part]:
+    """The values at `places` as stretches of the arrays."""
+    begins = np.cumsum([0, *map(len, arrays)]).tolist()
+    edges = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
+    parts: list[Part] = []
+    for at, end in pairwise(edges):
+        while at < end:
+            place = int(places[at])
+            owner = bisect_right(begins, place) - 1
+            size = min(end - at, begins[owner + 1] - place)
+            parts.append((arrays[owner], None, np.array([[at, place - begins[owner], size]], dtype=np.int64)))
+            at += size
+    return parts

@@ -1,0 +1,102 @@
+"""One table of gaps from those of several logs on one grid: what is missing in all that could have it, and what lies between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.ingest.concat.axes import group_axes
+from gyrostab.ingest.concat.grid import Piece
+from gyrostab.ingest.gap_table import CAUSE, END, FIRST, clip_table, thinned
+from gyrostab.schema import GAP_CAUSES
+from gyrostab.time.grid import grid_index
+
+__all__ = ["join_gaps"]
+
+Table = NDArray[np.int64]
+
+_MISSING, _DUPLICATE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("duplicate")
+_NONE: Table = np.empty((0, 5), dtype=np.int64)
+_FAR = np.iinfo(np.int64).max // 2
+
+
+def _own_gaps(piece: Piece) -> Table:
+    """The table of one log, on the common grid."""
+    log, source = piece.source.log.variables, piece.source
+    table = _NONE
+    if "gap_start" in log and log["gap_start"].size:
+        ends = (log[name].values.astype("datetime64[ns]").view(np.int64) for name in ("gap_start", "gap_end"))
+        first, end = (piece.on_grid(np.rint(grid_index(source.start, source.rate, stamps)).astype(np.int64)) for stamps in ends)
+        samples = log["gap_samples"].values.astype(np.int64)
+        rows = log["gap_rows"].values.astype(np.int64) if "gap_rows" in log else np.zeros_like(samples)
+        table = np.stack([first, end, samples, rows, log["gap_cause"].values.astype(np.int64)], axis=1)
+    return np.concatenate([table, _slips(piece)]) if len(piece.runs) > 1 else table
+
+
+def _slips(piece: Piece) -> Table:
+    """Samples left empty, or left out, where a slightly different rate has drifted by one sample."""
+    end, own_end = piece.runs[:-1, 0] + piece.runs[:-1, 2], piece.runs[:-1, 1] + piece.runs[:-1, 2]
+    start, own = piece.runs[1:, 0], piece.runs[1:, 1]
+    cause = np.where(start > end, _MISSING, _DUPLICATE)
+    return np.stack([end, start, start - end, own - own_end, cause], axis=1)
+
+
+def _both(held: Table, new: Table) -> Table:
+    """What is missing in both of two logs, with the cause that the first of them gives; its events stay."""
+    lines = [held[held[:, FIRST] == held[:, END]]]
+    lines += [clip_table(held[held[:, END] > held[:, FIRST]], int(first), int(end)) for first, end in new[:, [FIRST, END]] if end > first]
+    return np.concatenate(lines)
+
+
+def join_gaps(pieces: Sequence[Piece]) -> Table:
+    """Return the table of gaps of the joined log; what is missing in some axes only is a gap as well.
+
+    Parameters
+    ----------
+    pieces : sequence of Piece
+        In the order in which they were placed.
+
+    Returns
+    -------
+    ndarray of int64, shape (n, 5)
+        Columns of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
+    """
+    groups = [[pieces[number] for number in group] for group in group_axes([piece.source.axes for piece in pieces])]
+    spans = sorted((min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups)
+    if len(groups) == 1 or any(later[0] >= earlier[1] for earlier, later in pairwise(spans)):
+        table = thinned(_join_group(pieces, pieces[0].first, None))  # the same axes, or others at another time
+    else:
+        end = max(end for _, end in spans)
+        tables = [_join_group(group, spans[0][0], end) for group in groups]
+        table = thinned(np.unique(np.concatenate(tables), axis=0))  # a gap of several axes is one line
+    return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
+
+
+def _join_group(pieces: Sequence[Piece], begin: int, stop_at: int | None) -> Table:
+    """Return the gaps of logs that have axes in common, from sample `begin` on and up to `stop_at` if it is given."""
+    tables: list[Table] = []
+    firsts: list[int] = []
+    ends: list[int] = []
+    end = begin
+    for piece in pieces:
+        new = _own_gaps(piece)
+        tables.append(new)
+        if piece.first > end:
+            cause = piece.cause if piece.cause >= 0 else _MISSING
+            tables[-1] = np.concatenate([[[end, piece.first, piece.first - end, 0, cause]], new])
+        stop = min(piece.end, end)
+        if piece.first < stop:
+            for place in np.flatnonzero((np.array(ends) > piece.first) & (np.array(firsts) < stop)):
+                held = tables[place]
+                inside = _both(clip_table(held, piece.first, stop), clip_table(new, piece.first, stop))
+                tables[place] = np.concatenate([clip_table(held, -_FAR, piece.first), inside, clip_table(held, stop, _FAR)])
+            tables[-1] = np.concatenate([clip_table(new, -_FAR, piece.first), clip_table(new, stop, _FAR)])
+        firsts.append(min(piece.first, end))
+        ends.append(piece.end)
+        end = max(end, piece.end)
+    if stop_at is not None and stop_at > end:
+        tables.append(np.array([[end, stop_at, stop_at - end, 0, _MISSING]], dtype=np.int64))
+    return np.concatenate([*tables, _NONE])

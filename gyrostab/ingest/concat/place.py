@@ -1,0 +1,239 @@
+"""Where the samples of each log lie on the grid of the first: by stamps, by samples that two logs share, or after a step of the clock.
+
+The rules are those that hold for raw rows: rows that two files hold count once, files whose clocks merely cover the same hours are no
+copies of each other, and after a step of the clock the pause is of unknown length, so that one sample is taken as missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.ingest.concat.grid import Piece, Source, Stretch, read_stretches, runs_of
+from gyrostab.ingest.concat.notes import first_few, some
+from gyrostab.ingest.gap_table import duration, stamp_text
+from gyrostab.schema import GAP_CAUSES
+from gyrostab.time.grid import grid_index, grid_times
+
+__all__ = ["place_logs"]
+
+#: Distance from the grid that is not worth a word [samples].
+SMALL = 0.01
+#: Samples that may lie on those of the log before, with other values, before it is taken as a step of the clock (as among raw rows).
+FEW = 16
+#: Samples by which the grids of two logs with common samples may be displaced: the first stamp of each has its own jitter.
+REACH = 64
+
+_COMPARED = 2**13  # samples at each end of an overlap whose values are compared
+_PROBED = 64  # of them, so many are looked at for a displacement
+_SURE = 32  # common samples that it takes to see a displacement
+_SAME = 0.9  # share of the compared samples that must be alike; a copy may have been damaged
+_BATCH = 50  # logs whose overlaps are read at once
+_Cache = dict[Stretch, NDArray[np.float64]]
+_STEP, _RESTART = GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart")
+
+
+@dataclass(frozen=True)
+class _Match:
+    """Samples that two logs were compared at, those that are alike, and by how many samples the later log is displaced."""
+
+    common: int
+    same: int
+    shift: int
+
+    @property
+    def alike(self) -> bool:
+        return self.common >= 2 and self.same >= _SAME * self.common
+
+
+def _compare(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
+    """Number of samples (last dimension) at which both have a number on some axis (first), and at which all numbers are the same."""
+    known = np.isfinite(held) & np.isfinite(new)
+    told = known.any(axis=0)
+    same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~known).all(axis=0) & told
+    return told.sum(axis=-1), same.sum(axis=-1)
+
+
+def _best(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
+    """Compare `new` with `held`, which is `REACH` samples longer on either side, in place or displaced by a few samples."""
+    size = new.shape[1]
+    here = _Match(*_compare(held[:, REACH : REACH + size], new), 0)
+    if here.alike or here.common < _SURE:
+        return here
+    probe = np.flatnonzero(np.isfinite(new).any(axis=0))[:_PROBED]
+    shifts = np.array(sorted(range(-REACH, REACH + 1), key=abs))
+    common, same = _compare(held[:, REACH + shifts[:, None] + probe], new[:, None, probe])
+    for shift in shifts[(common >= _SURE) & (same >= _SAME * common)].tolist():
+        there = _Match(*_compare(held[:, REACH + shift : REACH + shift + size], new), shift)
+        if there.alike and there.common >= _SURE:
+            return there
+    return here
+
+
+def _lag(held: Source, new: Source) -> int:
+    """Sample of `held` at which `new` begins, by the clock."""
+    return int(np.rint(grid_index(held.start, held.rate, new.start)))
+
+
+def _stretches(held: Source, new: Source, lag: int) -> list[tuple[Stretch, Stretch]]:
+    """The ends of the overlap in both logs, to be compared: the earlier with some more samples on either side."""
+    low, high = max(lag, 0), min(lag + new.size, held.size)
+    if high <= low:
+        return []
+    ends = dict.fromkeys([(low, min(high, low + _COMPARED)), (max(low, high - _COMPARED), high)])
+    return [((held, begin - REACH, end + REACH), (new, begin - lag, end - lag)) for begin, end in ends]
+
+
+def _neighbours(sources: Sequence[Source]) -> _Cache:
+    """What it takes to compare each log with the next, read at once."""
+    pairs = [pair for held, new in pairwise(sources) if held.end >= new.start for pair in _stretches(held, new, _lag(held, new))]
+    return read_stretches(one for pair in pairs for one in pair)
+
+
+def _match(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
+    """Compare two logs where the clock says that both have samples: sample 0 of `new` at sample `lag` of `held`."""
+    axes = [axis for axis in held.axes if axis in new.axes]
+    pairs = _stretches(held, new, lag)
+    if not axes or not pairs:
+        return _Match(0, 0, 0)
+    rows_held, rows_new = ([source.axes.index(axis) for axis in axes] for source in (held, new))
+    found: list[_Match] = []
+    for there, here in pairs:
+        if found and found[0].common >= _COMPARED // 2 and found[0].same < 0.5 * found[0].common:
+            break  # no copy, whatever its end is like
+        cache.update(read_stretches(one for one in (there, here) if one not in cache))
+        found.append(_best(cache[there][rows_held], cache[here][rows_new]))
+    surest = max(found, key=lambda match: (match.alike, match.same))
+    return _Match(sum(match.common for match in found), sum(match.same for match in found), surest.shift)
+
+
+def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Piece], list[str]]:
+    """Place logs on the grid of the first.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+        In the order of their first stamps.
+    max_gap : float
+        A longer pause is a step of the clock [s].
+
+    Returns
+    -------
+    pieces : list of Piece
+        The same order; the first sample of all is sample 0.
+    notes : list of str
+        Sentences on logs between the samples of the grid, on overlaps and on steps of the clock.
+    """
+    rate = sources[0].rate
+    pieces: list[Piece] = []
+    overlaps: list[str] = []
+    breaks: list[str] = []
+    cache: _Cache = {}
+    for number, source in enumerate(sources):
+        if number % _BATCH == 0:
+            cache = _neighbours(sources[max(number - 1, 0) : number + _BATCH])
+        piece, match = _next(pieces, source, rate, max_gap, cache)
+        if match is not None:
+            overlaps.append(_overlap_note(piece, *match, rate))
+        elif piece.cause >= 0:
+            breaks.append(_break_note(pieces, piece))
+        pieces.append(piece)
+    notes = [
+        *_grid_notes(pieces, rate),
+        *first_few(breaks, "steps of the clock are in the table of gaps"),
+        *first_few(overlaps, "overlaps"),
+    ]
+    lowest = min(piece.first for piece in pieces)
+    return [_moved(piece, -lowest) for piece in pieces], notes
+
+
+def _moved(piece: Piece, by: int) -> Piece:
+    if not by:
+        return piece
+    return Piece(piece.source, piece.runs + np.array([by, 0, 0]), piece.off, (piece.clock[0], piece.clock[1] + by), piece.cause)
+
+
+def _next(pieces: list[Piece], source: Source, rate: float, max_gap: float, cache: _Cache) -> tuple[Piece, tuple[Piece, _Match] | None]:
+    """The next log on the grid, and the log that it overlaps, if it does."""
+    ratio = rate / source.rate
+    if not pieces:
+        return Piece(source, runs_of(0, 0.0, source.size, ratio), 0.0, (source.start, 0)), None
+    differing: tuple[Piece, _Match] | None = None
+    silent: tuple[Piece, _Match] | None = None
+    for held in reversed(pieces):
+        if held.source.end < source.start or not set(held.source.axes) & set(source.axes):
+            continue  # other axes over the same time are no overlap
+        lag = _lag(held.source, source)
+        match = _match(held.source, source, lag, cache)
+        if match.alike:
+            first = int(held.on_grid(lag + match.shift))
+            return Piece(source, runs_of(first, 0.0, source.size, ratio), 0.0, held.clock), (held, match)
+        if match.common:
+            differing = differing or (held, match)
+        else:
+            silent = silent or (held, match)
+    clock = pieces[-1].clock
+    position = float(grid_index(clock[0], rate, source.start)) + clock[1]
+    first, end = int(np.rint(position)), max(piece.end for piece in pieces)
+    back, ahead = end - first > FEW and differing is not None, first - end > max_gap * rate
+    if back or ahead:
+        cause = _RESTART if back and _begins_again(pieces, source) else _STEP
+        return Piece(source, runs_of(end + 1, 0.0, source.size, ratio), 0.0, (source.start, end + 1), cause), None
+    off = position - first
+    return Piece(source, runs_of(first, off, source.size, ratio), off, clock), (differing or silent) if first < end else None
+
+
+def _begins_again(pieces: list[Piece], source: Source) -> bool:
+    """Whether a clock that was set back began anew, rather than being corrected."""
+    latest = max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
+    elapsed = latest - pieces[-1].clock[0]
+    return source.start <= pieces[0].source.start + 0.1 * elapsed or 2 * (latest - source.start) > elapsed
+
+
+def _grid_notes(pieces: Sequence[Piece], rate: float) -> list[str]:
+    """Sentences on logs that lie between the samples of the grid or have a slightly different rate."""
+    notes = []
+    between = [piece for piece in pieces if abs(piece.off) > SMALL]
+    if between:
+        most = max(abs(piece.off) for piece in between)
+        names = some([piece.source.name for piece in between])
+        notes.append(
+            f"{names}: begin between two samples of the grid of {pieces[0].source.name}; their samples were put on the nearest ones, "
+            f"at most {most:.2g} of a sample ({duration(most / rate)}) away"
+        )
+    other = [piece for piece in pieces if piece.source.rate != rate]
+    if other:
+        most = max(abs(piece.source.rate / rate - 1) for piece in other)
+        notes.append(
+            f"{some([piece.source.name for piece in other])}: the sampling rate is up to {1e6 * most:.3g} parts per million from the "
+            f"{rate:.10g} Hz of {pieces[0].source.name}; each sample was put on the nearest one of its grid"
+        )
+    return notes
+
+
+def _overlap_note(piece: Piece, held: Piece, match: _Match, rate: float) -> str:
+    name, holder = piece.source.name, held.source.name
+    first, end = max(piece.first, held.first), min(piece.end, held.end)
+    if not match.alike:
+        what = "hold other values" if match.common else "are missing in one of them"
+        return f"{name}: {max(end - first, 0)} samples lie on samples of {holder} and {what}; those of {holder} are kept where it has them"
+    begin = stamp_text(int(grid_times(*held.clock[:1], rate, first - held.clock[1])))
+    whole = "all of it is" if end >= piece.end else f"{duration((end - first) / rate)} from {begin} are"
+    differ = f"; {match.common - match.same} of {match.common} compared samples differ" if match.same < match.common else ""
+    return f"{name}: {whole} in {holder} too, and counted once{differ}; the samples of {holder} are kept where it has them"
+
+
+def _break_note(pieces: Sequence[Piece], piece: Piece) -> str:
+    before = max(one.source.end for one in pieces if one.clock == pieces[-1].clock)
+    jump = (piece.source.start - before) / 1e9
+    what = "time restarts" if piece.cause == _RESTART else "the clock steps"
+    return (
+        f"{piece.source.name}: {what}: from {stamp_text(before)} to {stamp_text(piece.source.start)}, {duration(abs(jump))} "
+        f"{'back' if jump < 0 else 'ahead'}; the pause is of unknown length, so the samples that follow come after one missing sample"
+        + ("" if jump < 0 else "; if the pause is real, raise max_gap")
+    )

@@ -1,0 +1,144 @@
+"""Files of an archive that cannot be read: what is said of them, and where the gap lies that each of them leaves."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import FormatError, GyrostabError
+from gyrostab.ingest.options import FileSummary
+from gyrostab.schema import texts
+
+__all__ = ["LostFile", "check_share", "is_damage", "lost_attributes", "lost_spans"]
+
+#: When a larger share of the files cannot be read, it is no damage but a wrong option.
+MAX_LOST = 0.5
+
+#: What the system says of itself and not of the one file.
+_SYSTEM = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EINTR)
+
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class LostFile:
+    """A file that cannot be read, and why."""
+
+    path: Path
+    reason: str
+
+
+def is_damage(path: Path, error: Exception) -> bool:
+    """Whether an error tells of one damaged or missing file, so that the others can be read all the same.
+
+    A wrong option, a missing unit, or a system without room, memory or file handles is none.
+    """
+    if path.is_dir() and path.suffix.lower() != ".zarr":
+        return False
+    if isinstance(error, GyrostabError):
+        return isinstance(error, FormatError) and not isinstance(error.__cause__, MemoryError)
+    return isinstance(error, OSError) and error.errno not in _SYSTEM
+
+
+def reason_of(path: Path, error: Exception) -> str:
+    """What is wrong with the file, in one line that begins with its name."""
+    if isinstance(error, OSError) and not isinstance(error, GyrostabError):
+        return f"{path.name}: cannot be read ({error.strerror or error})"
+    text = " ".join(str(error).split())
+    return text if path.name in text.split(": ")[0] else f"{path.name}: {text}"
+
+
+def check_share(lost: Sequence[LostFile], total: int) -> None:
+    """Refuse to go on when more than half of the files cannot be read.
+
+    Raises
+    ------
+    FormatError
+        With the reason of the first.
+    """
+    if len(lost) > MAX_LOST * total:
+        what = "that is more than damage: check the names and the reading options"
+        raise FormatError(f"{lost[0].reason}; {len(lost)} of {total} files cannot be read, {what}")
+
+
+def _name_key(path: Path) -> list[tuple[int, int, str]]:
+    """Order of names in which run_9 comes before run_10."""
+    return [(0, int(piece), "") if piece.isdigit() else (1, 0, piece) for piece in re.split(r"(\d+)", str(path)) if piece]
+
+
+def lost_spans(lost: Sequence[LostFile], spans: Mapping[Path, Span], look: Callable[[Path], FileSummary]) -> dict[Path, Span]:
+    """Where the time of the lost files lies, of those that let it be told.
+
+    A lost file fills the time between the files whose names come before and after its own, when these follow each other in
+    time with a gap between them. Otherwise the stamps that a look at the file still shows tell it.
+
+    Parameters
+    ----------
+    lost : sequence of LostFile
+        Files that could not be read.
+    spans : mapping of Path to (int, int)
+        First and last stamp [ns since 1970] of the files that were read.
+    look : callable
+        Path to `FileSummary`; may fail.
+
+    Returns
+    -------
+    dict of Path to (int, int)
+        First and last instant [ns since 1970].
+    """
+    names = sorted([*spans, *(one.path for one in lost)], key=_name_key)
+    found: dict[Path, Span] = {}
+    for path in (one.path for one in lost):
+        place = names.index(path)
+        before = next((name for name in reversed(names[:place]) if name in spans), None)
+        after = next((name for name in names[place:] if name in spans), None)
+        between = _between(spans, before, after) if before and after else None
+        span = between or _seen(path, look)
+        if span:
+            found[path] = span
+    return found
+
+
+def _between(spans: Mapping[Path, Span], before: Path, after: Path) -> Span | None:
+    """Time between two files that follow each other, in either order, without a third one in between."""
+    (_, end), (start, _) = sorted([spans[before], spans[after]])
+    others = [span for path, span in spans.items() if path not in (before, after)]
+    free = end < start and not any(first < start and last > end for first, last in others)
+    return (end, start) if free else None
+
+
+def _seen(path: Path, look: Callable[[Path], FileSummary]) -> Span | None:
+    """First and last stamp that a look at a damaged file shows."""
+    with contextlib.suppress(GyrostabError, OSError, RuntimeError, ValueError):
+        summary = look(path)
+        if summary.first is not None and summary.last is not None and summary.first < summary.last:
+            return _ns(summary.first), _ns(summary.last)
+    return None
+
+
+def _ns(stamp: np.datetime64) -> int:
+    return int(stamp.astype("datetime64[ns]").astype(np.int64))
+
+
+def lost_attributes(log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Path, Span]) -> xr.Dataset:
+    """The log with notes on the lost files, and their names in ``unreadable_files``."""
+    if not lost:
+        return log
+    notes = []
+    for one in lost:
+        where = "where no other file has its time, there is a gap"
+        if one.path in spans:
+            first, last = (str(np.datetime64(stamp, "ns").astype("datetime64[ms]")) for stamp in spans[one.path])
+            where = f"its time is between {first} and {last}, which is a gap unless another file has it"
+        notes.append(f"{one.reason}; the file is left out: {where}")
+    return log.assign_attrs(
+        notes=[*texts(log, "notes"), *notes],
+        unreadable_files=[*log.attrs.get("unreadable_files", []), *(one.path.name for one in lost)],
+    )

@@ -1,0 +1,349 @@
+"""From paths to one raw log: find the reader, read, put the files in order, add the channels of other files."""
+
+from __future__ import annotations
+
+import glob
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import replace
+from functools import cache, partial
+from importlib.metadata import entry_points
+from pathlib import Path
+from threading import Event
+from typing import Any, Protocol, cast
+
+import xarray as xr
+
+from gyrostab.errors import FormatError, GyrostabError, OptionError, reading_of
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.pieces import Spool
+from gyrostab.ingest.combine import attach_channels, concatenate, memory, to_disk
+from gyrostab.ingest.concat import join_logs, log_span
+from gyrostab.ingest.damaged_files import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
+from gyrostab.ingest.formats.binary import has_layout
+from gyrostab.ingest.formats.unread import refuse_unread
+from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.overlap import stamp_span
+from gyrostab.schema import texts
+
+__all__ = ["OnFile", "Reader", "check_options", "read_log", "readers", "scan_file"]
+
+GROUP = "gyrostab.readers"
+#: Text files that are read side by side.
+_TOGETHER = 2
+
+#: Called with the number of a file, the number of files and the path.
+OnFile = Callable[[int, int, Path], None]
+
+
+class Reader(Protocol):
+    """What a reader module has."""
+
+    def matches(self, path: Path) -> bool:
+        """Whether the file is of this format."""
+
+    def scan(self, path: Path, options: ReadOptions) -> FileSummary:
+        """Look without reading the data."""
+
+    def read(self, path: Path, options: ReadOptions) -> xr.Dataset:
+        """Read into a raw log, or open a regular log."""
+
+
+@cache
+def _registered() -> dict[str, Any]:
+    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+
+
+def readers() -> tuple[str, ...]:
+    """Names of the formats that can be read.
+
+    Examples
+    --------
+    >>> "text" in readers()
+    True
+    """
+    return tuple(_registered())
+
+
+def _reader(path: Path) -> Reader:
+    """The reader of a file; text is tried last, as it is the least particular."""
+    if not path.exists():
+        raise FormatError(f"{path}: there is no such file")
+    if not has_layout(path):
+        refuse_unread(path)
+    for name in sorted(_registered(), key=lambda name: (name == "text", name)):
+        reader = cast(Reader, _registered()[name].load())
+        if reader.matches(path):
+            return reader
+    if path.is_dir():
+        raise FormatError(f"{path}: no reader takes this directory; name the files in it, for instance {path / '*.csv'}")
+    what = f"no reader takes this file with the suffix {path.suffix!r}, and it is not text"
+    raise FormatError(f"{path}: {what}; formats are {', '.join(readers())}: save it as one of these")
+
+
+def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
+    """The files that paths and patterns stand for, each once.
+
+    Raises
+    ------
+    FormatError
+        When a pattern fits no file.
+    """
+    found: list[Path] = []
+    for item in [paths] if isinstance(paths, str | Path) else paths:
+        text = str(item)
+        if Path(text).exists() or not glob.has_magic(text):
+            matching = [Path(text)]
+        else:
+            matching = [Path(match) for match in sorted(glob.glob(text, recursive=True))]
+            if not matching:
+                raise FormatError(f"{text}: no file fits this pattern")
+        found += [path for path in matching if path not in found]
+    if not found:
+        raise OptionError("no file was given; name at least one log")
+    return found
+
+
+def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSummary:
+    r"""Look at a file without reading its data.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    options : ReadOptions, optional
+        Reading options; what they leave unclear stands in the notes.
+
+    Returns
+    -------
+    FileSummary
+        Format, columns, axes, channels, and what is cheap to know of the stamps and the number of rows.
+
+    Raises
+    ------
+    FormatError
+        When no reader takes the file, or it cannot be read at all.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = Path(mkdtemp()) / "log.csv"
+    >>> _ = path.write_text("time [s],gyro_x [deg/h]\n0.0,1.5\n0.5,1.25\n")
+    >>> summary = scan_file(path)
+    >>> summary.axes, summary.n_rows, summary.last
+    (('x',), 2, np.datetime64('1970-01-01T00:00:00.500000000'))
+    """
+    path = Path(path)
+    reader = _reader(path)
+    with reading_of(path):
+        return reader.scan(path, options or ReadOptions())
+
+
+def _read(path: Path, options: ReadOptions) -> xr.Dataset:
+    reader = _reader(path)
+    with reading_of(path):
+        return reader.read(path, options)
+
+
+def read_log(
+    paths: str | Path | Iterable[str | Path],
+    *,
+    rate: float | None = None,
+    start: str | None = None,
+    epoch: str | None = None,
+    map: Mapping[str, str] | None = None,
+    unit: Mapping[str, str] | None = None,
+    kind: str | None = None,
+    channel: str | Path | Sequence[str | Path] = (),
+    strict: bool = False,
+    max_gap: str | float = "10D",
+    limits: Mapping[str, float] | None = None,
+    on_file: OnFile | None = None,
+) -> xr.Dataset:
+    r"""Read one log or many as they were written.
+
+    Parameters
+    ----------
+    paths : path, pattern, or several of them
+        Files are put in the order of their first stamps and joined; an axis or channel that one of them lacks is NaN there.
+        Either raw logs, or regular logs that gyrostab wrote, which become one regular log without being loaded.
+    rate : float, optional
+        Sampling rate [Hz] of files without a time column.
+    start : str, optional
+        Stamp of the first row (ISO 8601, UTC) of files without a time column.
+    epoch : str, optional
+        Zero of a numeric time column (ISO 8601, UTC); 1970-01-01 when not given.
+    map : mapping of str to str, optional
+        Header name -> contract name, ``{"wx": "gyro_x [deg/s]"}``; ``"-"`` drops a column.
+    unit : mapping of str to str, optional
+        Name -> unit, ``{"gyro": "deg/s", "time": "us"}``.
+    kind : {"rate", "angle"}, optional
+        How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` increments.
+    channel : path or sequence of path, optional
+        Files with further channels; each keeps its stamps as ``time_<channel>``.
+    strict : bool
+        Raise an error for a damaged or missing file. Otherwise one among several is left out with a note, and its time is a gap.
+    max_gap : str or float
+        Between regular logs, a longer step of time is taken as a step of the clock (raw logs: see `gyrostab.regularise`);
+        a number is in seconds.
+    limits : mapping of str to float, optional
+        Limits of `gyrostab.ingest.limits` with other values, ``{"columns": 50_000}``.
+    on_file : callable, optional
+        Called with the number of the file (from 1), the number of files and the path before each file is read.
+
+    Returns
+    -------
+    xarray.Dataset
+        The raw log: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree], ``time(row)`` where the file has
+        stamps (NaT where unreadable), channels, and the attributes ``kind``, ``source_files``, ``row_start``, ``notes``,
+        ``unreadable_rows``, ``unreadable_cells``. Regular logs that gyrostab wrote are returned as one such log, lazily.
+        ``unreadable_files`` lists the files that were left out.
+
+    Raises
+    ------
+    FormatError, UnitError, OptionError, TimeError
+        With the file, the place, what is wrong and what to do. `FormatError` also when more than half of the files cannot be read.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = Path(mkdtemp()) / "log.csv"
+    >>> _ = path.write_text("time [s],gyro_x [deg/s],temperature [degC]\n0.0,0.5,21\n0.5,****,\n1.0,0.25,\n")
+    >>> raw = read_log(path)
+    >>> raw.rate.sel(axis="x").values
+    array([1800.,   nan,  900.])
+    >>> raw.attrs["notes"][-1]
+    'log.csv: 1 of 3 rows are unreadable: line 3'
+    """
+    options = ReadOptions(
+        rate=rate,
+        start=start,
+        epoch=epoch,
+        map=dict(map or {}),
+        unit=dict(unit or {}),
+        kind=kind,
+        channel=cast(Any, channel),
+        strict=strict,
+        limits=dict(limits or {}),
+    )
+    found = expand(paths)
+    extra = expand(options.channel) if options.channel else []
+    parts, lost = _read_all(found, options, on_file)
+    regular = [path for path, part in parts.items() if "sampling_rate_hz" in part.attrs]
+    if regular and len(regular) < len(parts):
+        raw = next(path for path in parts if path not in regular)
+        raise OptionError(
+            f"{regular[0].name} is a regular log already and {raw.name} is not; make a regular log of the latter and its like with "
+            "gyrostab ingest, and then join the regular logs"
+        )
+    channels = [_read(path, replace(options, channels_only=True, start=None)) for path in extra]
+    spans = lost_spans(lost, _spans(parts), lambda path: scan_file(path, options)) if lost else {}
+    if regular:
+        log = join_logs(
+            [_check_regular(part, path.name, options) for path, part in parts.items()],
+            regular,
+            max_gap=max_gap,
+            lost=list(spans.values()),
+            limits=options.limits,
+        )
+    else:
+        check_options([*parts.values(), *channels])
+        log = concatenate(list(parts.values()))
+        if lost and "time" not in log.variables:
+            raise FormatError(f"{lost[0].reason}; the files have no time stamps, so the time of those that follow it is not known: mend it")
+        if spans:
+            log.attrs["unreadable_spans"] = [list(span) for span in spans.values()]  # where regularise will find the gaps
+    return attach_channels(lost_attributes(log, lost, spans), channels)
+
+
+def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None = None) -> tuple[dict[Path, xr.Dataset], list[LostFile]]:
+    """Read the files one by one; what does not fit into memory together waits on disk."""
+    parts: dict[Path, xr.Dataset] = {}
+    lost: list[LostFile] = []
+    spool = Spool()
+    held = 0
+    with closing(_ahead(paths, options, on_file)) as reading:
+        for path, read in zip(paths, reading, strict=True):
+            try:
+                part = read()
+            except (GyrostabError, OSError) as error:
+                if options.strict or len(paths) == 1 or not is_damage(path, error):
+                    raise
+                lost.append(LostFile(path, reason_of(path, error)))
+                continue
+            held += memory(part)
+            if held > SPILL_BYTES and len(paths) > 1:
+                held -= memory(part)
+                part = to_disk(part, spool)
+            parts[path] = part
+    check_share(lost, len(paths))
+    return parts, lost
+
+
+def _ahead(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None) -> Generator[Callable[[], xr.Dataset], None, None]:
+    """What reads each file; a text file is read already, while the one before it is looked at, as its beginning takes one thread."""
+    stop = Event()
+    with ThreadPoolExecutor(_TOGETHER, thread_name_prefix="gyrostab-file") as pool:
+        waiting: deque[Callable[[], xr.Dataset]] = deque()
+        try:
+            for number, path in enumerate(paths, 1):
+                if on_file is not None:
+                    on_file(number, len(paths), path)
+                early = len(paths) > 1 and _is_text(path)
+                waiting.append(pool.submit(_read_text, path, options, stop).result if early else partial(_read, path, options))
+                if len(waiting) == _TOGETHER:
+                    yield waiting.popleft()
+            while waiting:
+                yield waiting.popleft()
+        finally:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _read_text(path: Path, options: ReadOptions, stop: Event) -> xr.Dataset:
+    reader = _registered()["text"].load()
+    with reading_of(path):
+        return cast(xr.Dataset, reader.read(path, options, stop=stop.is_set))
+
+
+def _is_text(path: Path) -> bool:
+    try:
+        return bool(_reader(path) is _registered()["text"].load())
+    except FormatError:
+        return False  # which reading will say
+
+
+def _spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:
+    """First and last stamp [ns since 1970] of the files that have stamps."""
+    spans = {}
+    for path, part in parts.items():
+        if "sampling_rate_hz" in part.attrs:
+            spans[path] = log_span(part)
+        elif "time" in part.variables:
+            spans[path] = stamp_span(part)
+    return spans
+
+
+def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Dataset:
+    """A regular log has its rate, names and units; what the user says against that is refused, what is idle is noted."""
+    rate = float(log.attrs["sampling_rate_hz"])
+    if options.rate is not None and abs(options.rate / rate - 1) > 1e-6:
+        raise OptionError(
+            f"{name} is a regular log of {rate:.10g} Hz, not of {options.rate:.10g} Hz; leave out --rate, or ingest its source anew"
+        )
+    idle = [f"--{option}" for option in ("start", "epoch", "map", "unit", "kind") if getattr(options, option)]
+    if not idle or options.channel:
+        return log
+    note = f"{name}: is a regular log already, so {', '.join(idle)} is not used"
+    return log.assign_attrs(notes=[*texts(log, "notes"), note])
+
+
+def check_options(parts: Sequence[xr.Dataset]) -> None:
+    """Refuse a ``--map`` or ``--unit`` that no file has a use for: it is a slip of the pen."""
+    unmatched = set.intersection(*(set(part.attrs.pop("unmatched_options", ())) for part in parts))
+    headers = dict.fromkeys(name for part in parts for name in part.attrs.pop("headers", ()))
+    if unmatched:
+        files = ", ".join(dict.fromkeys(name for part in parts for name in part.attrs["source_files"]))
+        raise OptionError(f"{' and '.join(sorted(unmatched))}: no such column in {files}; the columns are {', '.join(headers)}")

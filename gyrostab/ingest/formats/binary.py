@@ -1,0 +1,117 @@
+"""Raw binary files, by a layout that stands beside them: ``run7.bin`` with ``run7.bin.toml`` (or ``run7.toml``, or ``layout.toml``).
+
+The layout names the fields of a record in their order, with units in the header's way::
+
+    header_bytes = 512          # before the first record; 0 when left out
+    byte_order = "little"       # or "big"
+    fields = [
+        {name = "time [us]", type = "uint32"},
+        {name = "gyro_x [0.1 arcsec/s]", type = "int32"},
+        {skip = 4},             # bytes
+    ]
+"""
+
+from __future__ import annotations
+
+import tomllib
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import FormatError, OptionError
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["has_layout", "matches", "read", "scan"]
+
+SUFFIXES = (".bin", ".raw")
+TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
+
+
+def matches(path: Path) -> bool:
+    """Whether a layout for it stands beside the file, or it is called ``.bin`` or ``.raw``."""
+    return path.is_file() and path.suffix.lower() != ".toml" and (path.suffix.lower() in SUFFIXES or has_layout(path))
+
+
+def has_layout(path: Path) -> bool:
+    """Whether a layout of its own stands beside a file."""
+    return _named(path).is_file()
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Fields, number of records, the stamps of the two ends."""
+    table, notes = _table(path)
+    return scan_tables(path, "binary", [table], options, notes)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a binary file; see `gyrostab.ingest.read_log`."""
+    table, notes = _table(path)
+    return read_tables(path, [table], options, notes=notes, limit=limit)
+
+
+def _named(path: Path) -> Path:
+    return path.with_name(f"{path.name}.toml")
+
+
+def _layout(path: Path) -> tuple[Path, dict[str, Any]]:
+    places = [_named(path), path.with_suffix(".toml"), path.with_name("layout.toml")]
+    place = next((place for place in places if place.is_file()), None)
+    if place is None:
+        example = 'fields = [{name = "time [us]", type = "uint32"}, {name = "gyro_x [deg/h]", type = "int32"}]'
+        raise OptionError(
+            f"{path.name}: nothing says how its records are laid out; write {places[0].name} beside it, for instance: {example}"
+        )
+    try:
+        return place, tomllib.loads(place.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise OptionError(f"{place.name}: this layout is no TOML ({error}); correct it") from error
+
+
+def _record(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], int]:
+    """The type of a record, and the bytes before the first."""
+    known = {"header_bytes", "byte_order", "fields"}
+    if odd := sorted(set(layout) - known):
+        raise OptionError(f"{place.name}: {odd[0]!r} is no part of a layout; known are {', '.join(sorted(known))}")
+    order = {"little": "<", "big": ">"}.get(layout.get("byte_order", "little"))
+    header = layout.get("header_bytes", 0)
+    if order is None or not isinstance(header, int) or header < 0:
+        raise OptionError(f'{place.name}: byte_order is "little" or "big", and header_bytes a whole number; correct the layout')
+    names, types, offsets, size = [], [], [], 0
+    for number, one in enumerate(layout.get("fields", ()), 1):
+        if isinstance(one, dict) and set(one) == {"skip"} and isinstance(one["skip"], int) and one["skip"] > 0:
+            size += one["skip"]
+            continue
+        if not isinstance(one, dict) or set(one) != {"name", "type"} or one["type"] not in TYPES:
+            what = f'is {{name = "...", type = "..."}} or {{skip = BYTES}}, the types are {", ".join(TYPES)}'
+            raise OptionError(f"{place.name}: field {number} {what}; correct the layout")
+        names.append(str(one["name"]))
+        types.append(np.dtype(order + np.dtype(one["type"]).str[1:]))
+        offsets.append(size)
+        size += types[-1].itemsize
+    if not names or len(set(names)) < len(names):
+        raise OptionError(f"{place.name}: a layout needs fields with names of their own; correct it")
+    return np.dtype({"names": names, "formats": types, "offsets": offsets, "itemsize": size}), header
+
+
+def _table(path: Path) -> tuple[Table, list[str]]:
+    place, layout = _layout(path)
+    record, header = _record(place, layout)
+    rows, rest = divmod(path.stat().st_size - header, record.itemsize)
+    if rows < 1:
+        what = f"{path.stat().st_size} bytes, but {header} of header and {record.itemsize} a record"
+        raise FormatError(f"{path.name}: it holds no record by the layout {place.name} ({what}); copy it again, or correct the layout")
+    notes = [f"the last {rest} bytes are no whole record of {record.itemsize} bytes; is the layout right?"] if rest else []
+    names = tuple(record.names or ())
+    columns = tuple(partial(_part, path, record, header, name) for name in names)
+    return Table(rows, names, (None,) * len(names), columns), notes
+
+
+def _part(path: Path, record: np.dtype[Any], header: int, name: str, start: int, stop: int) -> Any:
+    records = np.memmap(path, dtype=record, mode="r", offset=header + start * record.itemsize, shape=(stop - start,))
+    values = np.array(records[name])
+    return values.astype(values.dtype.newbyteorder("="))

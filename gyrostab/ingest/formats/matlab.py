@@ -1,0 +1,196 @@
+"""MATLAB files, version 5 and 7.3, and plain HDF5 files: vectors by name, columns of a matrix by ``name/3`` (counted from 0).
+
+The rows of a matrix run along its longer side. Fields of a structure are called ``name.field``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.headers import AXIS, KNOWN, TIME, is_time_unit
+from gyrostab.ingest.columns.plan import Plan, plan_columns
+from gyrostab.ingest.columns.typed import Fetch, float32_note, read_columns, summarise
+from gyrostab.ingest.formats.matlab5 import check_structure
+from gyrostab.ingest.formats.packing import ATTRIBUTES, fold_packing, text_attributes
+from gyrostab.ingest.limits import check_chunk, check_stored
+from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.store.rows import LibraryRows, Rows, hdf5_rows
+
+__all__ = ["matches", "read", "scan"]
+
+HDF_SUFFIXES = (".h5", ".hdf5")
+_PLAIN_ARRAYS = (
+    "of a timeseries ts: s.time = ts.Time; s.data = ts.Data; save('log.mat', '-struct', 's'); "
+    "of a table or timetable: writetable(T, 'log.csv') or writetimetable(T, 'log.csv')"
+)
+#: A matrix with more columns than this is no table of sensors.
+MAX_COLUMNS = 64
+
+
+@dataclass(frozen=True)
+class _Vector:
+    """One column of the file: the array that it is in, and where its numbers lie."""
+
+    header: str
+    array: Any  # numpy array or h5py dataset
+    stored: Rows
+
+    @property
+    def rows(self) -> int:
+        return int(max(self.array.shape))
+
+
+def matches(path: Path) -> bool:
+    """Whether the file is called ``.mat``, or ``.h5`` or ``.hdf5``, which is what MATLAB 7.3 writes within."""
+    return path.is_file() and path.suffix.lower() in (".mat", *HDF_SUFFIXES)
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Variables and their shapes, the stamps of the two ends."""
+    with ExitStack() as stack:
+        vectors, plan, fetch, notes = _look(path, options, stack)
+        name = "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab"
+        return summarise(name, plan, options, vectors[0].rows, fetch, notes)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a MATLAB file; see `gyrostab.ingest.read_log`."""
+    with ExitStack() as stack:
+        vectors, plan, fetch, notes = _look(path, options, stack)
+        notes += float32_note(plan, [vector.array.dtype for vector in vectors])
+        check_stored(path, vectors[0].rows, len(plan.columns), options.limits)
+        lasting = all(not isinstance(vectors[column.source].stored, LibraryRows) for column in plan.columns)
+        return read_columns(plan, options, vectors[0].rows, fetch, notes=notes, limit=limit, lasting=lasting)
+
+
+def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vector], Plan, Fetch, list[str]]:
+    objects: list[str] = []
+    found = [vector for name, array in _arrays(path, stack, objects) for vector in _vectors(path, name, array, options)]
+    if not found and objects:
+        what = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
+        raise FormatError(f"{path.name}: {what}; save plain arrays instead: {_PLAIN_ARRAYS}")
+    if not found:
+        raise FormatError(f"{path.name}: there is no vector or matrix of numbers in it; save plain arrays")
+    rows = max(vector.rows for vector in found)
+    kept = [vector for vector in found if vector.rows == rows]
+    others = [vector.header for vector in found if vector.rows != rows]
+    notes = [f"left out, as they are shorter than the {rows} rows of the longest: {', '.join(others[:20])}"] if others else []
+    if objects:
+        notes.append(f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to keep it, {_PLAIN_ARRAYS}")
+    attributes = [_attributes(vector.array) for vector in kept]
+    units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
+    headers = [vector.header for vector in kept]
+    plan = plan_columns(path, headers, options, units=units, calendars=calendars, coded=_known_fields(headers))
+    plan, decoders = fold_packing(plan, [vector.array.dtype for vector in kept], attributes)
+    return kept, plan, lambda source, start, stop: decoders[source](kept[source].stored.read(start, stop)), notes
+
+
+def _known_fields(headers: Sequence[str]) -> dict[int, str]:
+    """Fields of structures whose own names are ours, ``gyro_x`` of ``S.gyro_x``, where no other field has that name."""
+    names = [header.rpartition(".")[2] for header in headers]
+    times = [place for place, name in enumerate(names) if TIME.match(name.lower())]
+    found = {place: name.lower() for place, name in enumerate(names) if AXIS.match(name.lower()) or KNOWN.match(name.lower())}
+    found = {place: name for place, name in found.items() if list(found.values()).count(name) == 1}
+    if len(times) == 1:
+        suffix = next((text for text in TIME.match(names[times[0]].lower()).groups() if text), None)  # type: ignore[union-attr]
+        found[times[0]] = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
+    return {place: name for place, name in found.items() if "." in headers[place]}
+
+
+def _attributes(array: Any) -> dict[str, Any]:
+    """Return what the attributes of an HDF5 dataset say of its numbers; such a file may follow the CF conventions."""
+    attributes = getattr(array, "attrs", {})
+    return {name: attributes[name] for name in ATTRIBUTES if name in attributes}
+
+
+def _vectors(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[_Vector]:
+    shape = array.shape
+    if len(shape) not in (1, 2) or max(shape, default=0) <= 1:
+        return
+    if chunks := getattr(array, "chunks", None):
+        check_chunk(path, name, array.dtype.itemsize * math.prod(chunks), options.limits)
+    along, size = int(np.argmax(shape)), min(shape) if len(shape) == 2 else 1
+    locate = (None if isinstance(array, np.ndarray) else hdf5_rows(path, array)) or partial(LibraryRows, array)
+    if size == 1:
+        yield _Vector(name, array, locate(along, 0))
+    elif size <= MAX_COLUMNS:
+        yield from (_Vector(f"{name}/{place}", array, locate(along, place)) for place in range(size))
+
+
+def _arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
+    """Arrays of numbers by their names; what is an object of MATLAB is added to `objects`."""
+    with path.open("rb") as file:
+        head = file.read(1024)
+    if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
+        yield from _arrays_hdf(path, stack, objects)
+        return
+    from scipy.io import loadmat
+
+    check_structure(path)
+    try:
+        content = loadmat(path, simplify_cells=False, struct_as_record=True, chars_as_strings=True)
+    except Exception as error:  # scipy raises bare errors of many kinds on damaged files
+        raise FormatError(f"{path.name}: this MATLAB file cannot be read ({error}); it may be cut off, copy it again") from error
+    for name, value in content.items():
+        if not name.startswith("__"):
+            yield from _flatten(name, value, objects)
+
+
+def _flatten(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, Any]]:
+    from scipy.io.matlab import MatlabObject, MatlabOpaque
+
+    fields = value.dtype.names if isinstance(value, np.ndarray) else None
+    if isinstance(value, MatlabOpaque):
+        entry = value.reshape(-1)[0] if value.size else None
+        kind = _text(entry["s2"]) if entry is not None and fields and "s2" in fields else "object"
+        objects.append(f"a {kind}" + (f" {_text(entry['s0'])!r}" if entry is not None and fields and "s0" in fields else ""))
+    elif isinstance(value, MatlabObject):
+        objects.append(f"an object of class {value.classname!r}")
+    elif fields and value.size == 1:
+        for field in fields:
+            yield from _flatten(f"{name}.{field}", value.reshape(-1)[0][field], objects)
+    elif fields and value.size > 1:  # table2struct: one structure a row
+        for field in fields:
+            cells = [np.asarray(cell) for cell in value[field].reshape(-1)]
+            if all(cell.size == 1 and cell.dtype.kind in "biuf" for cell in cells):
+                yield f"{name}.{field}", np.array([cell.item() for cell in cells])
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        yield name, value
+
+
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _arrays_hdf(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
+    import h5py
+
+    try:
+        file = stack.enter_context(h5py.File(path, "r"))
+    except OSError as error:
+        what = f"this HDF5 file (MATLAB 7.3 is one) cannot be opened ({error})"
+        raise FormatError(f"{path.name}: {what}; it may be cut off, copy it again") from error
+    found: list[tuple[str, Any]] = []
+
+    def visit(name: str, item: Any) -> None:
+        text = item.attrs.get("MATLAB_class", b"double")
+        kind = text.decode() if isinstance(text, bytes) else str(text)
+        if "MATLAB_object_decode" in item.attrs and not name.startswith("#"):
+            objects.append(f"a {kind} {name!r}")
+            return
+        if isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and kind != "char" and not name.startswith("#"):
+            found.append((name.replace("/", "."), item))
+
+    file.visititems(visit)
+    yield from found

@@ -1,0 +1,143 @@
+"""miniSEED files: a channel by its code (``HJ3``), or by network, station and code where several stations have it. No units are in them.
+
+Channels whose code is that of a rotation sensor (instrument code J: ``HJZ``, ``BJ1``) are gyro axes, named by their orientation.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.formats.optional import library
+from gyrostab.ingest.formats.tables import Part, Table, plain_names, read_tables, scan_tables
+from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.time.grid import grid_times
+
+__all__ = ["matches", "read", "scan"]
+
+SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
+_HEAD = re.compile(rb"\d{6}[DRQM][ \0]|MS\x03")
+_MOST_RECORD = 2**20  # longest record that is looked for [bytes]; version 2 allows more, nobody writes it
+_ROTATION = re.compile(r"(?:^|\.)[A-Z]J([A-Z0-9])$")  # band, instrument J, orientation: SEED manual, appendix A
+_TOGETHER = 0.1  # channels that begin so near to each other share their stamps [samples]
+
+
+@dataclass
+class _Trace:
+    """Unbroken pieces of one channel: first stamps [ns], rate [Hz], samples, values if they are wanted."""
+
+    name: tuple[str, ...]
+    rate: float
+    starts: list[int] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    values: list[NDArray[Any]] = field(default_factory=list)
+
+
+def matches(path: Path) -> bool:
+    """Whether the file begins as miniSEED does, version 2 or 3, or is called like it."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return bool(_HEAD.match(file.read(8))) or path.suffix.lower() in SUFFIXES
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Channels, and the stamps of the records' headers."""
+    return scan_tables(path, "miniseed", _tables(_traces(path, unpack=False)), options, _cut_note(path))
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a miniSEED file; see `gyrostab.ingest.read_log`."""
+    return read_tables(path, _tables(_traces(path, unpack=True)), options, notes=_cut_note(path), limit=limit)
+
+
+def _cut_note(path: Path) -> list[str]:
+    """A note where the last record of version 2 is not complete: all records of such a file have the length of the first."""
+    pymseed = library("pymseed", path, extra="miniseed")
+    with path.open("rb") as file:
+        head = file.read(_MOST_RECORD)
+    if not head or not _HEAD.match(head):
+        return []
+    try:
+        first = next(iter(pymseed.MS3Record.from_buffer(head)), None)
+    except pymseed.MiniSEEDError:
+        return []
+    rest = path.stat().st_size % first.reclen if first is not None and first.formatversion == 2 else 0
+    return [f"cut off in its last record: {rest} bytes are left out, the complete records are read"] if rest else []
+
+
+def _traces(path: Path, *, unpack: bool) -> list[_Trace]:
+    pymseed = library("pymseed", path, extra="miniseed")
+    traces: dict[tuple[str, float], _Trace] = {}
+    try:
+        found = pymseed.MS3TraceList.from_file(str(path), unpack_data=unpack)
+        for trace in found:
+            for piece in trace:
+                if piece.samplecnt < 1 or piece.samprate <= 0 or (unpack and piece.sampletype not in ("i", "f", "d")):
+                    continue  # texts and logs of the station
+                code = pymseed.sourceid2nslc(trace.sourceid)
+                one = traces.setdefault((trace.sourceid, piece.samprate), _Trace(tuple(code), piece.samprate))
+                one.starts.append(int(piece.starttime))
+                one.sizes.append(int(piece.samplecnt))
+                if unpack:
+                    one.values.append(np.array(piece.np_datasamples))
+    except pymseed.MiniSEEDError as error:
+        raise FormatError(f"{path.name}: this miniSEED file cannot be read ({error}); it may be cut off, copy it again") from error
+    return list(traces.values())
+
+
+def _tables(traces: list[_Trace]) -> list[Table]:
+    """Channels of one rate whose pieces begin together are one table; the last piece of some may be shorter, as in a file that is cut."""
+    groups: list[list[_Trace]] = []
+    for trace in traces:
+        same = [group for group in groups if _in_step(group[0], trace)]
+        same[0].append(trace) if same else groups.append([trace])
+    names = dict(zip(map(id, traces), plain_names([trace.name for trace in traces]), strict=True))
+    tables = []
+    for group in groups:
+        longest = max(group, key=lambda trace: sum(trace.sizes))
+        rows = sum(longest.sizes)
+        values = tuple(partial(_part, trace.values, rows) for trace in group)
+        own = tuple(names[id(trace)] for trace in group)
+        tables.append(Table(rows, own, (None,) * len(group), values, _stamps(longest), coded=tuple(map(_axis, own))))
+    return tables
+
+
+def _in_step(one: _Trace, other: _Trace) -> bool:
+    apart = _TOGETHER * 1e9 / one.rate
+    same = one.rate == other.rate and one.sizes[:-1] == other.sizes[:-1] and len(one.sizes) == len(other.sizes)
+    return same and all(abs(a - b) <= apart for a, b in zip(one.starts, other.starts, strict=True))
+
+
+def _axis(name: str) -> str | None:
+    """The gyro axis that a channel of a rotation sensor is."""
+    match = _ROTATION.search(name)
+    return f"gyro_{match.group(1).lower()}" if match else None
+
+
+def _part(pieces: list[NDArray[Any]], rows: int, start: int, stop: int) -> NDArray[Any]:
+    values = (pieces[0] if len(pieces) == 1 else np.concatenate(pieces))[start:stop]
+    missing = min(stop, rows) - start - len(values)
+    return np.concatenate([values.astype(np.float64), np.full(missing, np.nan)]) if missing > 0 else values
+
+
+def _stamps(trace: _Trace) -> Part:
+    ends = np.cumsum(trace.sizes)
+
+    def part(start: int, stop: int) -> NDArray[np.datetime64]:
+        rows = np.arange(start, min(stop, int(ends[-1])))
+        piece = np.searchsorted(ends, rows, side="right")
+        first = (ends - trace.sizes)[piece]
+        stamps: NDArray[np.datetime64] = (np.array(trace.starts)[piece] + grid_times(0, trace.rate, rows - first)).view("datetime64[ns]")
+        return stamps
+
+    return part

@@ -1,0 +1,317 @@
+"""How a variable's stored numbers become values: packing, fill values and valid ranges by the CF conventions.
+
+References
+----------
+CF conventions 1.11, sections 2.5.1 (missing data, valid ranges) and 8.1 (packed data); NetCDF users guide,
+appendix A (``_Unsigned``, and the units of valid ranges).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import partial
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from xarray.backends import BackendArray
+from xarray.core.indexing import ExplicitIndexer, IndexingSupport, LazilyIndexedArray, explicit_indexing_adapter
+
+from gyrostab.errors import FormatError, UnitError
+from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.stamps import NAT, TimeUnit, floats_to_ns, integers_to_ns, names_epoch, parse_time_unit, signed_counts
+
+__all__ = ["ATTRIBUTES", "Decoder", "Packing", "attribute_text", "decode_variables", "fold_packing", "text_attributes"]
+
+#: Stored numbers -> counts or values.
+Decoder = Callable[[Any], Any]
+
+_PACKING = ("_Unsigned", "_FillValue", "missing_value", "valid_range", "valid_min", "valid_max", "scale_factor", "add_offset")
+#: Attributes of a variable that say how its numbers are read.
+ATTRIBUTES = (*_PACKING, "units", "calendar")
+
+
+@dataclass(frozen=True)
+class Packing:
+    """What the attributes of one variable say of its stored numbers.
+
+    Attributes
+    ----------
+    dtype : dtype
+        The type that the stored bytes stand for: unsigned where ``_Unsigned`` says so.
+    missing : tuple of number
+        Stored numbers that mean "no value", in `dtype`.
+    low, high : float
+        Stored numbers outside this range are invalid.
+    scale, offset : float
+        ``value = stored * scale + offset``.
+    """
+
+    dtype: np.dtype[Any]
+    missing: tuple[Any, ...] = ()
+    low: float = -np.inf
+    high: float = np.inf
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @classmethod
+    def from_attributes(cls, where: str, dtype: Any, attributes: Mapping[str, Any]) -> Packing:
+        """Read the attributes of a variable.
+
+        Parameters
+        ----------
+        where : str
+            File and variable, for messages.
+        dtype : dtype
+            Type of the stored numbers, in any byte order.
+        attributes : mapping of str to Any
+            All attributes as the file holds them, with their types.
+
+        Raises
+        ------
+        FormatError
+            When an attribute has no usable value.
+
+        Examples
+        --------
+        >>> packing = Packing.from_attributes("gyro_x", "i1", {"_Unsigned": "true", "scale_factor": 0.5, "_FillValue": np.int8(-1)})
+        >>> packing.read_values(np.array([-2, -1, 4], dtype="i1")).tolist()
+        [127.0, nan, 2.0]
+        """
+        stored: np.dtype[Any] = np.dtype(dtype).newbyteorder("=")
+        found = {key: attributes[key] for key in _PACKING if key in attributes}
+        if stored.kind in "iu" and (text := attribute_text(found.get("_Unsigned"))):
+            stored = np.dtype(f"{'u' if text.lower() == 'true' else 'i'}{stored.itemsize}")
+        wraps = "_Unsigned" in found
+        numbers = {key: _numbers(where, key, value, stored, wraps=wraps) for key, value in found.items() if key != "_Unsigned"}
+        scale, offset = (
+            float(numbers[key][0]) if key in numbers else neutral for key, neutral in (("scale_factor", 1.0), ("add_offset", 0.0))
+        )
+        if not (np.isfinite([scale, offset]).all() and scale != 0.0):
+            raise FormatError(f"{where}: scale_factor {scale:g} and add_offset {offset:g} are not usable; correct them")
+        missing = [value for key in ("_FillValue", "missing_value") for value in numbers.get(key, ())]
+        low, high = _valid_range(where, numbers, stored, scale, offset)
+        return cls(stored, tuple(_representable(missing, stored)), low, high, scale, offset)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether every stored number is a value as it stands."""
+        return self.is_plain and not self.missing and self.low == -np.inf and self.high == np.inf
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the stored numbers are the values."""
+        return self.scale == 1.0 and self.offset == 0.0
+
+    def read_counts(self, stored: Any) -> Any:
+        """Return stored numbers in their true sign; a masked array, or NaN among floats, where there is no value."""
+        array = np.asarray(stored)
+        native = array.astype(array.dtype.newbyteorder("="), copy=False)
+        counts = native.view(self.dtype) if native.dtype.itemsize == self.dtype.itemsize else native
+        invalid = self._find_invalid(counts)
+        if invalid is None or not invalid.any():
+            return counts
+        return np.where(invalid, self.dtype.type(np.nan), counts) if self.dtype.kind == "f" else np.ma.array(counts, mask=invalid)
+
+    def read_values(self, stored: Any) -> NDArray[np.float64]:
+        """Return unpacked values, NaN where there is none."""
+        counts = self.read_counts(stored)
+        values: NDArray[np.float64] = np.ma.filled(counts.astype(np.float64), np.nan)
+        return values if self.is_plain else values * self.scale + self.offset
+
+    def _find_invalid(self, counts: NDArray[Any]) -> NDArray[np.bool_] | None:
+        masks = [counts == value for value in self.missing]
+        if np.isfinite(self.low):
+            masks.append(counts < self.low)
+        if np.isfinite(self.high):
+            masks.append(counts > self.high)
+        return np.logical_or.reduce(masks) if masks else None
+
+
+def attribute_text(value: Any) -> str | None:
+    """Return an attribute that is text, or None for others and for a missing one."""
+    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    return value.decode(errors="replace") if isinstance(value, bytes) else value if isinstance(value, str) else None
+
+
+def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[int, str]:
+    """Return the text attribute `name` of those variables of several that have it, by their place."""
+    return {place: text for place, attrs in enumerate(attributes) if (text := attribute_text(attrs.get(name)))}
+
+
+def _numbers(where: str, key: str, value: Any, stored: np.dtype[Any], *, wraps: bool) -> NDArray[Any]:
+    """Return the numbers of an attribute; if `wraps`, signed ones of an unsigned variable are taken by their bits (users guide)."""
+    array = np.atleast_1d(np.asarray(value)).ravel()
+    if array.dtype.kind not in "iuf" or not array.size:
+        raise FormatError(f"{where}: the attribute {key} is {value!r}, not a number; correct it or remove it")
+    native = array.astype(array.dtype.newbyteorder("="))
+    if not wraps or native.dtype.kind == "f" or key in ("scale_factor", "add_offset"):
+        return native
+    # By their bits, whatever type holds them: attributes of Zarr stores are JSON, whose whole numbers have none.
+    if stored.itemsize == 8:
+        return native.view(stored)
+    wide, bits = native.astype(np.int64), 8 * stored.itemsize
+    return np.where((wide >= -(1 << bits - 1)) & (wide < 1 << bits), wide.astype(stored), wide)
+
+
+def _representable(missing: Iterable[Any], stored: np.dtype[Any]) -> Iterable[Any]:
+    """Yield the numbers that a variable can hold, in its type; NaN is missing anyway."""
+    for value in missing:
+        with np.errstate(all="ignore"):
+            own = stored.type(value) if stored.kind == "f" or _fits(value, stored) else None
+        if own is not None and own == own:
+            yield own
+
+
+def _fits(value: Any, stored: np.dtype[Any]) -> bool:
+    limits = np.iinfo(stored)
+    return bool(np.isfinite(value)) and float(value).is_integer() and limits.min <= int(value) <= limits.max
+
+
+def _valid_range(
+    where: str, numbers: Mapping[str, NDArray[Any]], stored: np.dtype[Any], scale: float, offset: float
+) -> tuple[float, float]:
+    """Return the range of valid stored numbers.
+
+    The attributes are in packed units. Only where they are floats as the scale factor is, and the variable holds integers,
+    are they in unpacked units (users guide); half a count on either side is then left for rounding.
+    """
+    pair = numbers.get("valid_range")
+    if pair is not None and len(pair) != 2:
+        raise FormatError(f"{where}: the attribute valid_range has {len(pair)} numbers, not 2; correct it or remove it")
+    ends = {"low": pair[0], "high": pair[1]} if pair is not None else {}
+    ends |= {end: numbers[key][0] for end, key in (("low", "valid_min"), ("high", "valid_max")) if key in numbers}
+    ends = {end: value for end, value in ends.items() if not np.isnan(value)}
+    low, high = float(ends.get("low", -np.inf)), float(ends.get("high", np.inf))
+    law = numbers.get("scale_factor", numbers.get("add_offset"))
+    if stored.kind == "f":
+        return float(stored.type(low)), float(stored.type(high))
+    if law is None or law.dtype.kind != "f" or not all(value.dtype.kind == "f" for value in ends.values()):
+        return low, high
+    low, high = sorted(((low - offset) / scale, (high - offset) / scale))
+    return low - 0.5, high + 0.5
+
+
+def fold_packing(plan: Plan, dtypes: Sequence[Any], attributes: Sequence[Mapping[str, Any]]) -> tuple[Plan, dict[int, Decoder]]:
+    """Put the laws of packed variables into the factors of the plan, so that counts stay counts.
+
+    Parameters
+    ----------
+    plan : Plan
+        What each column is.
+    dtypes, attributes : sequence of dtype, sequence of mapping
+        Type and attributes of each column's variable, by the column's source.
+
+    Returns
+    -------
+    plan : Plan
+        With factors, offsets and time units that hold for what the decoders return.
+    decoders : dict of int to callable
+        Source -> stored numbers to counts, or to values where the law of a time variable is not one of whole nanoseconds.
+
+    Raises
+    ------
+    FormatError
+        When an attribute of a column that is read has no usable value.
+    """
+    columns: list[Column] = []
+    decoders: dict[int, Decoder] = {}
+    for column in plan.columns:
+        where = f"{plan.path.name}: variable {column.header!r}"
+        packing = Packing.from_attributes(where, dtypes[column.source], attributes[column.source])
+        decoders[column.source] = packing.read_counts
+        if column.role != "time":
+            offset = column.factor * packing.offset + column.offset
+            column = replace(column, factor=column.factor * packing.scale, offset=offset)
+        elif not packing.is_plain and column.time_unit is not None:
+            unit = _fold_time(column.time_unit, packing)
+            if unit is None:
+                decoders[column.source] = packing.read_values
+            else:
+                column = replace(column, time_unit=unit)
+        columns.append(column)
+    return replace(plan, columns=tuple(columns)), decoders
+
+
+def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
+    """Return the unit of the counts of a packed time variable, or None when it is none of whole nanoseconds."""
+    step, shift = unit.ns * Fraction(repr(packing.scale)), unit.ns * Fraction(repr(packing.offset))
+    if packing.dtype.kind == "f" or step.denominator != 1 or step <= 0 or shift.denominator != 1 or (shift and unit.epoch is None):
+        return None
+    return replace(unit, ns=step, epoch=None if unit.epoch is None else unit.epoch + int(shift))
+
+
+def decode_variables(name: str, stored: xr.Dataset) -> xr.Dataset:
+    """Unpack the numbers and stamps of a dataset that was opened without decoding them, as they are read.
+
+    Parameters
+    ----------
+    name : str
+        The file, for messages.
+    stored : xarray.Dataset
+        Variables as they are stored, with all attributes.
+
+    Returns
+    -------
+    xarray.Dataset
+        Packed numbers as float64 with NaN for what is missing or invalid, stamps as datetime64[ns]; the packing of whole
+        numbers is in the encoding.
+
+    Raises
+    ------
+    FormatError, UnitError
+        When an attribute has no usable value, or an epoch can be read in several ways.
+    """
+    variables = {key: _decode_variable(name, key, variable) for key, variable in stored.variables.items()}
+    coords = {key: variables.pop(key) for key in stored.coords}
+    decoded = xr.Dataset(variables, xr.Coordinates(coords, indexes={}), stored.attrs)
+    decoded.set_close(stored._close)
+    return decoded
+
+
+def _decode_variable(name: str, key: Any, variable: xr.Variable) -> xr.Variable:
+    if variable.dtype.kind not in "iuf":
+        return variable
+    packing = Packing.from_attributes(f"{name}: variable {key!r}", variable.dtype, variable.attrs)
+    attrs = {attribute: value for attribute, value in variable.attrs.items() if attribute not in _PACKING}
+    chunks = {key: value for key, value in variable.encoding.items() if key == "preferred_chunks"}
+    if names_epoch(str(attrs.get("units", ""))):
+        try:
+            unit = parse_time_unit(str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None)))
+        except UnitError as error:
+            raise UnitError(f"{name}: variable {key!r}: {error}") from error
+        stamps = _DecodedArray(variable, partial(_read_stamps, packing, unit), "datetime64[ns]")
+        return xr.Variable(variable.dims, LazilyIndexedArray(stamps), attrs, chunks)
+    if packing.is_identity and packing.dtype == variable.dtype:
+        return variable
+    encoding = dict(chunks)
+    if packing.dtype.kind in "iu" and packing.scale != 1.0:
+        encoding |= {"dtype": variable.dtype, "scale_factor": packing.scale}
+        encoding |= {"add_offset": packing.offset} if packing.offset else {}
+    values = _DecodedArray(variable, packing.read_values, np.float64)
+    return xr.Variable(variable.dims, LazilyIndexedArray(values), attrs, encoding)
+
+
+class _DecodedArray(BackendArray):
+    """An array whose parts are decoded as they are read, so that a part of it never loads the rest."""
+
+    def __init__(self, variable: xr.Variable, decode: Decoder, dtype: Any):
+        self.variable, self.decode = variable, decode
+        self.shape, self.dtype = variable.shape, np.dtype(dtype)
+
+    def __getitem__(self, key: ExplicitIndexer) -> Any:
+        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER, self._read)
+
+    def _read(self, key: tuple[Any, ...]) -> Any:
+        return self.decode(self.variable[key].values)
+
+
+def _read_stamps(packing: Packing, unit: TimeUnit, stored: Any) -> NDArray[np.datetime64]:
+    folded = unit if packing.is_plain else _fold_time(unit, packing)
+    counts = packing.read_values(stored) if folded is None else packing.read_counts(stored)
+    array = np.ma.getdata(counts)
+    stamps = floats_to_ns(array, unit, 0) if array.dtype.kind == "f" else integers_to_ns(signed_counts(array), folded or unit, 0)
+    return np.where(np.ma.getmaskarray(counts), NAT, stamps).view("datetime64[ns]")

@@ -1,0 +1,97 @@
+"""Parquet logs: one column per channel, units in square brackets or in the field's metadata."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.plan import Plan, plan_columns
+from gyrostab.ingest.columns.raw_log import Intake, Taken
+from gyrostab.ingest.columns.typed import batch_rows, convert_batch, float32_note, holds_dates, summarise
+from gyrostab.ingest.limits import check_stored
+from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.store.threads import in_order
+
+__all__ = ["matches", "read", "scan"]
+
+#: Bytes of a column that are read at one time: without a buffer, those of a whole row group, which may be a whole log.
+_BUFFER_BYTES = 2**20
+
+
+def matches(path: Path) -> bool:
+    """Whether the file begins as Parquet files do, or is called like one."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(4) == b"PAR1" or path.suffix.lower() in (".parquet", ".pq")
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Schema and row count from the footer, the stamps of the two ends."""
+    file, plan = _look(path, options)
+
+    def fetch(source: int, start: int, stop: int) -> Any:
+        group = 0 if start == 0 else file.num_row_groups - 1
+        parts = file.iter_batches(batch_size=batch_rows(1), row_groups=[group], columns=[file.schema_arrow.names[source]])
+        part = next(parts) if start == 0 else deque(parts, maxlen=1)[0]
+        values = _plain(part.column(0))
+        return values[: stop - start] if start == 0 else values[start - stop :]
+
+    return summarise("parquet", plan, options, file.metadata.num_rows, fetch)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a Parquet file; see `gyrostab.ingest.read_log`."""
+    file, plan = _look(path, options)
+    names = file.schema_arrow.names
+    check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
+    intake = Intake(plan.check(), options, limit=limit)
+    wanted = [names[column.source] for column in plan.columns]
+
+    def convert(batch: Any) -> Taken:
+        found = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
+        return convert_batch(intake, options, {column.source: _plain(found[names[column.source]]) for column in plan.columns})
+
+    for taken in in_order(convert, file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted)):
+        intake.add(taken)
+    return intake.finish(float32_note(plan, file.schema_arrow.types))
+
+
+def _look(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        file = parquet.ParquetFile(path, buffer_size=_BUFFER_BYTES, pre_buffer=False)
+        schema = file.schema_arrow
+        head = next(file.iter_batches(batch_size=50), None)
+    except (pa.ArrowException, OSError) as error:
+        raise FormatError(f"{path.name}: this Parquet file cannot be opened ({error}); it may be cut off, copy it again") from error
+    units = {}
+    for index, entry in enumerate(schema):
+        text = (entry.metadata or {}).get(b"units")
+        if text is not None:
+            units[index] = text.decode()
+    dates = [index for index in range(len(schema)) if head is not None and holds_dates(_plain(head.column(index)))]
+    return file, plan_columns(path, schema.names, options, units=units, stamped=dates)
+
+
+def _plain(column: Any) -> Any:
+    """An arrow column as numpy; nulls are masked where the type has no NaN."""
+    import pyarrow as pa
+
+    column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    kind = column.type
+    if pa.types.is_timestamp(kind):
+        return column.cast(pa.timestamp(kind.unit)).to_numpy(zero_copy_only=False)  # in UTC; `to_stamps` converts the unit
+    if pa.types.is_integer(kind) and column.null_count:
+        return np.ma.array(column.fill_null(0).to_numpy(zero_copy_only=False), mask=column.is_null().to_numpy(zero_copy_only=False))
+    if pa.types.is_decimal(kind):
+        return np.array([None if value is None else str(value) for value in column.to_pylist()], dtype=object)
+    return column.to_numpy(zero_copy_only=False)

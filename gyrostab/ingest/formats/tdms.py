@@ -1,0 +1,110 @@
+"""TDMS files (LabVIEW): a channel by its name, or with its group (``imu.wx``) where several have it, with its unit.
+
+Channels with waveform properties have stamps from these; otherwise a channel of times in the same group is the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
+from gyrostab.ingest.formats.optional import library
+from gyrostab.ingest.formats.tables import Part, Table, plain_names, read_tables, scan_tables
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+_NO_DATE = np.datetime64("1950-01-01", "us")  # LabVIEW counts from 1904, and writes that where it has no clock
+
+
+def matches(path: Path) -> bool:
+    """Whether the file begins as TDMS does, or is called like it."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(4) == b"TDSm" or path.suffix.lower() == ".tdms"
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Channels and their lengths, the stamps of the two ends."""
+    with _tables(path) as tables:
+        return scan_tables(path, "tdms", tables, options)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a TDMS file; see `gyrostab.ingest.read_log`."""
+    with _tables(path) as tables:
+        return read_tables(path, tables, options, limit=limit)
+
+
+@contextmanager
+def _tables(path: Path) -> Iterator[list[Table]]:
+    """Channels of one length and one clock are one table; without a clock, also of one group."""
+    nptdms = library("nptdms", path, extra="tdms")
+    try:
+        file = nptdms.TdmsFile.open(str(path))
+    except Exception as error:  # of many kinds on damaged files
+        raise FormatError(f"{path.name}: this TDMS file cannot be read ({error}); it may be cut off, copy it again") from error
+    with file:
+        channels = [channel for group in file.groups() for channel in group.channels() if len(channel)]
+        names = plain_names([(channel.group_name, channel.name) for channel in channels])
+        found: dict[Any, list[tuple[str, Any]]] = {}
+        for name, channel in zip(names, channels, strict=True):
+            clock = _clock(path, channel)
+            found.setdefault((len(channel), clock or channel.group_name), []).append((name, channel))
+        yield [_table(members, _clock(path, members[0][1])) for members in found.values()]
+
+
+def _clock(path: Path, channel: Any) -> tuple[float, Any] | None:
+    """Interval [s] and start of a waveform."""
+    properties = channel.properties
+    step = float(properties.get("wf_increment") or 0.0)
+    start = properties.get("wf_start_time")
+    if step <= 0.0:
+        return None
+    start = None if start is None or np.datetime64(start, "us") < _NO_DATE else np.datetime64(start, "us")
+    if start is not None:
+        began = int(dates_to_ns(np.array(start)))
+        if began == NAT:
+            raise FormatError(
+                f"{path.name}: channel {channel.name!r} begins at {start}, which is after the year 2262; correct wf_start_time"
+            )
+        start = np.datetime64(began, "ns")
+    offset = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
+    return step, offset if start is None else start + np.timedelta64(offset, "ns")
+
+
+def _table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> Table:
+    own = [(name, channel) for name, channel in members]
+    dates = None
+    if clock is None:
+        dates = next((channel for _, channel in own if np.dtype(channel.dtype).kind == "M"), None)
+        own = [(name, channel) for name, channel in own if channel is not dates]
+    units = tuple(str(channel.properties.get("unit_string") or "").strip() or None for _, channel in own)
+    stamps = _stamps(*clock) if clock else None if dates is None else partial(_part, dates)
+    dated = clock is None or isinstance(clock[1], np.datetime64)
+    columns = tuple(partial(_part, channel) for _, channel in own)
+    return Table(len(members[0][1]), tuple(name for name, _ in own), units, columns, stamps, None if dated else "ns")
+
+
+def _stamps(step: float, start: Any) -> Part:
+    def part(begin: int, stop: int) -> NDArray[Any]:
+        since = np.rint(np.arange(begin, stop) * (step * 1e9)).astype(np.int64)
+        stamps: NDArray[Any] = start + (since.view("timedelta64[ns]") if isinstance(start, np.datetime64) else since)
+        return stamps
+
+    return part
+
+
+def _part(channel: Any, start: int, stop: int) -> Any:
+    return np.asarray(channel[start:stop])

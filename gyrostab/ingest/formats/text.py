@@ -1,0 +1,276 @@
+"""Text logs: comma, semicolon, tab or blank separated, plain or gzipped, in one pass of bounded memory.
+
+Plain rows are read by a kernel, several blocks of the file side by side. From a row on that it does not know, a piece goes another
+way, and the more of them the longer it gets: a short one cell by cell, a long one to pyarrow, and only if that fails cell by cell.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import replace
+from functools import partial
+from io import BufferedReader
+from pathlib import Path
+from typing import IO, Any, NamedTuple, cast
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
+from gyrostab.ingest.columns.raw_log import Intake, Taken, summary_of
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
+from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.text.cells import VOID, Typing, parse_cells, parse_fast, parse_plain, stamp_types
+from gyrostab.ingest.text.layout import BLANK, Layout, find_layout, is_number, is_text, split_line, unit_of_duration
+from gyrostab.store.threads import in_order
+
+__all__ = ["matches", "read", "read_head", "scan"]
+
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
+#: Bytes of the file in which the layout is looked for; more, up to the second number, where they hold fewer lines than the third.
+HEAD_BYTES, MOST_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
+BLOCK_BYTES = 2**22
+PIECE_BYTES = 2**18
+LINE_BYTES = 2**8
+SHORT_BYTES = 2**13
+PART_BYTES = 2**16
+COUNTED_BYTES = 2**24
+
+
+def matches(path: Path) -> bool:
+    """Whether the file has the name of a text log (gzipped or not), or holds text with figures in it whatever its name is."""
+    name = path.name.lower().removesuffix(".gz")
+    return path.is_file() and (name.endswith(SUFFIXES) or _holds_text(path))
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Header, columns, first and (of plain files) last stamp, from the two ends of the file."""
+    layout, plan = _look(path, options)
+    time, rows = plan.time, None
+    head = tail = np.empty(0, np.int64)
+    if time is not None:
+        head = _stamps(layout, time, layout.samples, options)
+    if not _gzipped(path):
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            file.seek(max(layout.offset, size - 2**14))
+            ends = [split_line(line, layout.separator) for line in file.read().decode("latin-1").splitlines()]
+            if time is not None:
+                tail = _stamps(layout, time, [row for row in ends if _is_solid(row, layout, time.source)], options)
+            if size <= COUNTED_BYTES:
+                file.seek(layout.offset)
+                rows = sum(1 for line in file if line.strip() and not line.lstrip().startswith((b"#", b"%")))
+    return summary_of(plan, "text", rows, head=head, tail=tail, notes=layout.notes)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES, stop: Callable[[], bool] | None = None) -> xr.Dataset:
+    """The raw log of a text file; see `gyrostab.ingest.read_log`. Ends with `CancelledError` where `stop` comes to be true."""
+    layout, plan = _look(path, options)
+    options = options if plan.rate is None else replace(options, rate=plan.rate)
+    intake = Intake(plan.check(), options, limit=limit)
+    typing = Typing(layout, plan, options, stamp_types(layout, plan))
+    line = layout.line
+    for parts in in_order(partial(_take, typing=typing, intake=intake), _blocks(path, layout.offset)):
+        if stop is not None and stop():
+            raise CancelledError
+        for part in parts:
+            intake.add(part.taken, partial(_line_names, part, line))
+            line += part.lines
+    return intake.finish(layout.notes)
+
+
+def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
+    with _open(path) as file:
+        size, head = HEAD_BYTES, _chunk(path, file, HEAD_BYTES, 0)
+        while len(head) == size and size < MOST_HEAD_BYTES and head.count(b"\n") < HEAD_LINES:  # lines of very many cells
+            head += _chunk(path, file, size, size)
+            size *= 2
+        layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
+    stamped = [
+        column for column in range(layout.width) if any(looks_iso(row[column]) for row in layout.samples if len(row) == layout.width)
+    ]
+    plan = plan_columns(
+        path,
+        layout.headers,
+        options,
+        units=_durations(layout),
+        stamped=stamped,
+        rising=partial(_rises, layout),
+        above=layout.above,
+        is_filled=lambda column: any(row[column].strip() not in VOID for row in layout.samples if len(row) == layout.width),
+    )
+    return layout, plan
+
+
+def _durations(layout: Layout) -> dict[int, str]:
+    """The units of columns whose cells carry them, ``0.01 sec``."""
+    rows = [row for row in layout.samples if len(row) == layout.width]
+    found = {column: unit for column, cell in enumerate(rows[0]) if (unit := unit_of_duration(cell))} if rows else {}
+    return {column: unit for column, unit in found.items() if all(unit_of_duration(row[column]) == unit for row in rows)}
+
+
+def _rises(layout: Layout, column: int) -> bool:
+    """Whether the first cells of a column that hold something rise from row to row."""
+    cells = [row[column] for row in layout.samples if len(row) == layout.width and row[column].strip()]
+    if all(is_number(cell, comma=layout.decimal_comma) for cell in cells):
+        steps = np.diff([float(cell.replace(",", ".")) for cell in cells])
+    else:
+        stamps = texts_to_ns(cells)
+        steps = np.diff(stamps[stamps != NAT])
+    return bool(len(steps) and (steps >= 0).all() and steps.any())
+
+
+def _stamps(layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions) -> NDArray[np.int64]:
+    cells = [row[time.source] for row in rows if len(row) == layout.width]
+    if layout.decimal_comma:
+        cells = [cell.replace(",", ".") for cell in cells]
+    return cells_to_ns(cells, time.time_unit, options.epoch_ns)
+
+
+def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
+    """Whether a row holds a number beside its stamp."""
+    others = (cell for at, cell in enumerate(row) if at != time)
+    return len(row) == layout.width and (layout.width == 1 or any(is_number(cell, comma=layout.decimal_comma) for cell in others))
+
+
+def _gzipped(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
+
+
+def _holds_text(path: Path) -> bool:
+    try:
+        with _open(path) as file:
+            head = file.read(4096)
+    except (EOFError, zlib.error, OSError):
+        return False
+    return is_text(head) and any(48 <= code < 58 for code in head)
+
+
+def _open(path: Path) -> IO[bytes]:
+    return cast(IO[bytes], gzip.open(path, "rb")) if _gzipped(path) else path.open("rb")
+
+
+def read_head(path: Path) -> str:
+    """The first characters of a text file, plain or gzipped; nothing of other files."""
+    if not path.is_file() or not _holds_text(path):
+        return ""
+    with _open(path) as file:
+        return file.read(4096).decode("latin-1")
+
+
+def _chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
+    """Up to `size` bytes, short only at the end of the file."""
+    if isinstance(file, BufferedReader):
+        return file.read(size)
+    parts: list[bytes] = []
+    missing = size
+    try:
+        while missing > 0 and (part := file.read(min(missing, PART_BYTES))):
+            parts.append(part)
+            missing -= len(part)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        read = done + size - missing
+        what = f"the gzip stream is damaged or cut off; {read:,} bytes of text could be read before that ({error})"
+        rescue = f"copy the file again, or save the readable part with: gzip -dc {path.name} > rescued.csv"
+        raise FormatError(f"{path.name}: {what}. {rescue}") from error
+    return b"".join(parts)
+
+
+def _blocks(path: Path, offset: int) -> Iterator[bytes]:
+    """The data rows in blocks that end at the end of a line."""
+    with _open(path) as file:
+        done = len(_chunk(path, file, offset, 0))
+        rest = b""
+        while chunk := _chunk(path, file, BLOCK_BYTES, done):
+            done += len(chunk)
+            cut = chunk.rfind(b"\n") + 1
+            if cut == 0:
+                rest += chunk
+                if len(rest) > 4 * BLOCK_BYTES:
+                    raise FormatError(f"{path.name}: a line is longer than {len(rest):,} bytes; this is no text log with line ends")
+                continue
+            yield b"".join((rest, memoryview(chunk)[:cut]))
+            rest = chunk[cut:]
+        if rest.strip():
+            yield rest + b"\n"
+
+
+class _Part(NamedTuple):
+    """Rows of a block that were read in one way, and the text, whose lines tell where a row stands."""
+
+    taken: Taken
+    lines: int
+    block: bytes
+    span: slice
+
+
+def _take(block: bytes, typing: Typing, intake: Intake) -> list[_Part]:
+    """Read one block."""
+    parts: list[_Part] = []
+    start, reach, left = 0, LINE_BYTES, _lines(block, slice(None))
+    while start < len(block):
+        (values, stamps), stop = parse_plain(block, start, left, typing)
+        if stop > start:
+            lines = left if stop == len(block) else _lines(block, slice(start, stop))
+            parts.append(_Part(intake.prepare(values, stamps), lines, block, slice(start, stop)))
+            left -= lines
+        if stop == len(block):
+            break
+        reach = LINE_BYTES if stop - start > PIECE_BYTES else min(4 * reach, PIECE_BYTES)
+        start = block.find(b"\n", min(stop + reach, len(block) - 1)) + 1
+        parts.append(_take_piece(_tidy(block[stop:start], typing.layout.separator), typing, intake))
+        left -= parts[-1].lines
+    return parts
+
+
+def _lines(block: bytes, span: slice) -> int:
+    return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8)[span] == 10))
+
+
+def _take_piece(piece: bytes, typing: Typing, intake: Intake) -> _Part:
+    """Read rows of which one at least is not plain."""
+    lines = piece.count(b"\n")
+    parsed = parse_fast(piece, typing) if len(piece) > SHORT_BYTES else None
+    if parsed is not None:
+        rows = _rows(*parsed)
+        if rows == lines or b'"' not in piece or rows == sum(1 for text in piece.split(b"\n") if text.strip()):
+            return _Part(intake.prepare(*parsed), lines, piece, slice(None))  # otherwise a stray quote has swallowed line ends
+    values, stamps, words = parse_cells(piece, typing)
+    return _Part(intake.prepare(values, stamps, words=words), lines, piece, slice(None))
+
+
+def _rows(values: dict[int, NDArray[np.float64]], stamps: NDArray[np.int64] | None) -> int:
+    return len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
+
+
+def _line_names(part: _Part, first: int, rows: Sequence[int]) -> list[str]:
+    if part.taken.rows == part.lines:
+        return [f"line {first + row}" for row in rows]
+    tidy = _tidy(part.block[part.span], ",")
+    filled = [number for number, text in enumerate(tidy.split(b"\n"), first) if text.strip()]
+    return [f"line {filled[row]}" for row in rows]
+
+
+def _tidy(block: bytes, separator: str) -> bytes:
+    """Empty the comment lines (so that lines keep their numbers) and, where blanks separate, make each run of them one."""
+    if b"#" in block or b"%" in block:
+        block = re.sub(rb"(?m)^[ \t]*[#%][^\n]*", b"", block)
+    if separator != BLANK:
+        return block
+    data: NDArray[Any] = np.frombuffer(block.replace(b"\t", b" ").replace(b"\r", b""), dtype=np.uint8)
+    blank, end = data == 32, data == 10
+    drop = np.zeros(len(data), dtype=bool)
+    drop[1:] = blank[1:] & (blank[:-1] | end[:-1])
+    drop[:1] = blank[:1]
+    kept = data[~drop]
+    trailing = np.zeros(len(kept), dtype=bool)
+    trailing[:-1] = (kept[:-1] == 32) & (kept[1:] == 10)
+    return kept[~trailing].tobytes()

@@ -1,0 +1,71 @@
+"""PX4 logs (``.ulg``): a field by its name (``gyro_rad[0]``), or with its message (``sensor_combined.gyro_rad[0]``) where several have it.
+
+Stamps are microseconds since the autopilot began. The messages give no units.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.formats.optional import library
+from gyrostab.ingest.formats.tables import Table, plain_names, read_tables, scan_tables
+from gyrostab.ingest.options import FileSummary, ReadOptions
+
+__all__ = ["matches", "read", "scan"]
+
+MAGIC = b"ULog\x01\x12\x35"
+
+
+def matches(path: Path) -> bool:
+    """Whether the file begins as PX4 logs do, or is called like one."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC or path.suffix.lower() == ".ulg"
+
+
+def scan(path: Path, options: ReadOptions) -> FileSummary:
+    """Messages and their fields, first and last stamp; the format has no table of contents, so the file is gone through."""
+    tables, notes = _tables(path)
+    return scan_tables(path, "ulog", tables, options, notes)
+
+
+def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
+    """The raw log of a PX4 log; see `gyrostab.ingest.read_log`."""
+    tables, notes = _tables(path)
+    return read_tables(path, tables, options, notes=notes, limit=limit)
+
+
+def _tables(path: Path) -> tuple[list[Table], list[str]]:
+    pyulog = library("pyulog", path, extra="ulog")
+    try:
+        log = pyulog.ULog(str(path))
+    except Exception as error:  # of many kinds on damaged files
+        raise FormatError(f"{path.name}: this PX4 log cannot be read ({error}); it may be cut off, copy it again") from error
+    found = []
+    for message in log.data_list:
+        name = message.name + (f"_{message.multi_id}" if message.multi_id else "")
+        fields = [(field, values) for field, values in message.data.items() if field != "timestamp"]
+        found.append((name, message.data.get("timestamp"), fields))
+    names = iter(plain_names([(name, field) for name, _, fields in found for field, _ in fields]))
+    tables = []
+    for _, stamps, fields in found:
+        columns = tuple(partial(_part, values) for _, values in fields)
+        clock = None if stamps is None else partial(_part, stamps)
+        tables.append(
+            Table(len(fields[0][1]) if fields else 0, tuple(next(names) for _ in fields), (None,) * len(fields), columns, clock, "us")
+        )
+    lost = [dropout.duration for dropout in log.dropouts]
+    notes = [f"the logger says that it lost data {len(lost)} times, {sum(lost)} ms in all"] if lost else []
+    return tables, [*notes, *(["the log is damaged in places; messages there are missing"] if log.file_corruption else [])]
+
+
+def _part(values: Any, start: int, stop: int) -> Any:
+    return np.asarray(values)[start:stop]

@@ -1,0 +1,1 @@
+"""Raw rows to a regular log: sampling rate, place of every row, gaps."""

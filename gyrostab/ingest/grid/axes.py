@@ -1,0 +1,51 @@
+"""Raw logs whose axes have stamps of their own: each is put on a grid, and the grids side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import xarray as xr
+
+from gyrostab.ingest.concat import join_logs, some, split_axes
+from gyrostab.schema import texts
+from gyrostab.time.grid import first_stamp
+
+__all__ = ["regularise_axes"]
+
+
+def regularise_axes(
+    raw: xr.Dataset,
+    regularise: Callable[[xr.Dataset], xr.Dataset],
+    *,
+    max_gap: str | float,
+    limits: Mapping[str, float] | None,
+) -> xr.Dataset:
+    """Put the rows of each group of axes on a grid of its own, and their samples on the grid of the first.
+
+    Parameters
+    ----------
+    raw : xarray.Dataset
+        Raw log with the attribute ``axis_rows``: lists of axes, first row, row after the last.
+    regularise : callable
+        Makes a regular log of one group.
+    max_gap, limits
+        As for `gyrostab.ingest.concat.join_logs`.
+
+    Returns
+    -------
+    xarray.Dataset
+        One regular log; each sample of another group is the nearest to its stamp.
+    """
+    parts = [part.assign_attrs(notes=[]) for part in split_axes(raw)]
+    logs = [regularise(part) for part in parts]
+    labels = [some(texts(part, "source_files")) for part in parts]
+    if len(set(labels)) < len(labels):
+        labels = [f"{label} ({', '.join(axes)})" for label, (axes, _, _) in zip(labels, raw.attrs["axis_rows"], strict=True)]
+    log = join_logs(logs, labels, max_gap=max_gap, limits=limits)
+    starts = [first_stamp(each) for each in logs]
+    held = []
+    for label, start, (axes, _, _) in zip(labels, starts, raw.attrs["axis_rows"], strict=True):
+        later = (start - min(starts)) / 1e9 * log.attrs["sampling_rate_hz"]
+        held.append(f"{', '.join(axes)} in {label}" + (f" (begins {later:.3g} samples later)" if start > min(starts) else ""))
+    note = f"the axes have stamps of their own over the same time and form one log: {'; '.join(held)}"
+    return log.assign_attrs(notes=[*texts(raw, "notes"), *texts(log, "notes"), note])

@@ -1,0 +1,383 @@
+"""Rows with noisy stamps: the period that explains them best, and the place of every row in order.
+
+A stamp that is the time of arrival tells the time of its sample up to jitter, but thousands of stamps tell the sampling period to parts
+per million and the number of lost samples exactly. Rows stay in order; `gyrostab.kernels.course` finds where samples are missing.
+Where rows arrive in packets, or a slow clock gives many rows one stamp, only one row of each group is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.kernels.course import find_breaks, find_phase, follow, trace
+from gyrostab.kernels.stamps import DUPLICATE, NO_STAMP, RESTART, STEP, piece_sums
+
+__all__ = ["LEAST_SIGMA", "Course", "count_along", "find_course", "follow_course", "observe_rows", "place_rows"]
+
+Integers = NDArray[np.int64]
+Part = tuple[Integers, Integers]
+
+#: Standard deviation of the jitter that the kernel is given at least [samples].
+LEAST_SIGMA = 0.1
+#: Share of a deviation that the phase takes over, while the period is sought, and once it is known. A sample that is not found missing
+#: costs 1 / (4 gain sigma^2) nats before the phase has taken it over: 140 at a scatter of 0.6, against 5 for the loss and 30 for a row
+#: that has no sample.
+_SEARCH_GAIN, _GAIN = 0.02, 0.005
+#: Beyond this scatter [samples] those are less than 80.
+_MOST_SIGMA = 0.8
+#: Share of rows without a sample, and cost of a row [nats], beyond which stamps have no course. Jitter alone costs 0.5 nats, and every
+#: second sample missing at random 2.5 more.
+_MOST_DROPPED, _MOST_NATS = 0.01, 3.0
+#: Rows that a course is sought in, candidates for its period, and those of them that are refined.
+_SEARCH_ROWS, _MOST_CANDIDATES, _MOST_REFINED = 8_000, 200, 4
+#: A period wrong by half of this share lags by a fortieth of a sample behind the phase, which follows with a gain of 0.02.
+_PERIOD_STEP = 0.001
+_TRACE_ROWS = 1 << 13
+_AHEAD_ROWS = 1 << 12
+_MOST_ROWS, _MOST_AHEAD = 1 << 20, 1 << 18
+#: Samples that a row may be late without being taken for a clock set back.
+_LATE_SAMPLES = 16.0
+
+
+@dataclass(frozen=True)
+class Course:
+    """How noisy stamps follow the samples.
+
+    Attributes
+    ----------
+    period : float
+        Sampling period [ns].
+    sigma : float
+        Standard deviation of the jitter [samples].
+    observe : str
+        Rows whose stamps are looked at: ``"all"``, the ``"first"`` or the ``"last"`` of each group of rows with one stamp.
+    group : float
+        Rows to one that is looked at.
+    nats : float
+        Cost of a row.
+    fits : bool
+        Few rows have no sample, some steps are single ones, and the cost is that of jitter.
+    """
+
+    period: float
+    sigma: float
+    observe: str
+    group: float
+    nats: float
+    fits: bool = True
+
+    @property
+    def code_length(self) -> float:
+        """Nats that it takes to write a stamp down: those of its course, and of its deviation to the nanosecond."""
+        return self.nats + float(np.log(max(self.sigma, LEAST_SIGMA) * self.period))
+
+    @classmethod
+    def of_sharp(cls, period: float) -> Course:
+        """Make the course of stamps that scatter by less than a tenth of a sample."""
+        return cls(period, LEAST_SIGMA, "all", 1.0, 0.5)
+
+
+def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
+    """Find the rows whose stamps are looked at; of the last group of a block, the end is not known and taken to be its last row."""
+    known = np.flatnonzero(stamps != NO_STAMP)
+    if observe == "all" or len(known) == 0:
+        return known
+    apart = np.diff(stamps[known]) > 0.5 * period
+    edge = np.ones(1, dtype=bool)
+    return np.asarray(known[np.concatenate([edge, apart] if observe == "first" else [apart, edge])])
+
+
+def find_course(parts: list[Integers], guesses: list[float], observe: str, *, sure: float) -> Course | None:
+    """Find the period [ns] that explains stretches of stamps best, each row being the next sample but for rare losses.
+
+    Parameters
+    ----------
+    parts : list of ndarray of int64
+        Stretches of stamps [ns], all readable.
+    guesses : list of float
+        Periods [ns] to try in addition to those of the stretches themselves.
+    observe : str
+        See `Course`.
+    sure : float
+        Samples over which a first estimate of the period is trusted to count.
+
+    Returns
+    -------
+    Course or None
+        None where nothing explains the stamps.
+    """
+    seen = _take(parts, observe, guesses[0])
+    lengths = (32, 16) if observe == "all" else (8,)  # few groups in a row are whole where samples are lost
+    lines = next(filter(None, (_fit_lines(seen, length) for length in lengths)), None)
+    if lines is None or not (lines[0] > 0).any():
+        return None
+    slope, scatter = (values[lines[0] > 0] for values in lines)
+    sigma_ns = float(np.median(scatter))
+    group = _group(seen)
+    if sigma_ns > _MOST_SIGMA * float(np.median(slope)):
+        return None
+    sure *= max(1.0, group)
+    periods = _candidates(seen, slope, group)
+    sample = _shorten(seen, _SEARCH_ROWS)
+    best = sorted(periods, key=lambda period: _cost(sample, period, sigma_ns, sure))[:_MOST_REFINED]
+    started = [*((period, sigma_ns / period) for period in best), *((guess, LEAST_SIGMA) for guess in guesses)]
+    found = [_refine(seen, Course(period, sigma, observe, group, np.inf), sure) for period, sigma in started]
+    explained = min(filter(None, found), key=lambda course: course.code_length, default=None)
+    return explained if explained is not None and explained.fits else None  # the best may be stamps of rows that are given twice
+
+
+def follow_course(parts: list[Integers], period: float, observe: str, *, sure: float) -> Course | None:
+    """Give the course with a period near the one given [ns], None where the stamps do not follow it."""
+    seen = _take(parts, observe, period)
+    group = _group(seen)
+    found = _refine(seen, Course(period, 0.5, observe, group, np.inf), sure * max(1.0, group), most_off=0.02)
+    return found if found is not None and found.fits else None
+
+
+def _group(seen: list[Part]) -> float:
+    """Rows to one that is looked at."""
+    return float(sum(count[-1] - count[0] for count, _ in seen) / max(1, sum(len(count) - 1 for count, _ in seen)))
+
+
+def _take(parts: list[Integers], observe: str, period: float) -> list[Part]:
+    taken = []
+    for part in parts:
+        rows = observe_rows(part, observe, period)[1:-1]
+        if len(rows) > 1:
+            taken.append((rows, part[rows]))
+    return taken
+
+
+def _fit_lines(seen: list[Part], length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Fit lines to stretches of `length` stamps: slopes [ns a row], standard deviations of the residuals [ns]."""
+    tables = []
+    for count, stamps in seen:
+        if len(count) >= length:
+            first = np.arange(0, len(count) - length + 1, length // 2)
+            at = first[:, None] + np.arange(length)
+            tables.append(np.stack([count[at] - count[first, None], stamps[at] - stamps[first, None]]).astype(np.float64))
+    if not tables:
+        return None
+    count, stamps = np.concatenate(tables, axis=1)
+    count -= count.mean(axis=1, keepdims=True)
+    stamps -= stamps.mean(axis=1, keepdims=True)
+    slope = (count * stamps).sum(axis=1) / (count**2).sum(axis=1)
+    rest = stamps - slope[:, None] * count
+    return slope, np.sqrt((rest**2).sum(axis=1) / (length - 2))
+
+
+def _candidates(seen: list[Part], slope: NDArray[np.float64], group: float) -> list[float]:
+    """Periods [ns] around the slopes of stretches; losses make slopes larger, so the period is among the smaller ones."""
+    longer = _fit_lines(seen, 128)
+    slopes = longer[0] if longer is not None and len(longer[0]) >= 16 and group < 2 else slope
+    slopes = slopes[slopes > 0.2 * np.median(slope)]
+    low, high = np.quantile(slopes, [0.05, 0.6])
+    low, high = low * 0.995, max(high * 1.005, np.median(slope))
+    steps = int(min(np.ceil(np.log(high / low) * group / _PERIOD_STEP), _MOST_CANDIDATES)) + 1
+    return [float(period) for period in np.geomspace(low, high, steps)]
+
+
+def _shorten(seen: list[Part], rows: int) -> list[Part]:
+    most = max(64, rows // len(seen))
+    return [(count[:most], stamps[:most]) for count, stamps in seen]
+
+
+def _cost(seen: list[Part], period: float, sigma_ns: float, sure: float) -> float:
+    """Cost of a row [nats] with a period [ns]."""
+    sigma = max(sigma_ns / period, LEAST_SIGMA)
+    total = sum(follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, _TRACE_ROWS)[3] for count, stamps in seen)
+    return float(total / sum(len(count) for count, _ in seen))
+
+
+def _refine(seen: list[Part], course: Course, sure: float, *, most_off: float = 0.05) -> Course | None:
+    """Fit period and scatter along the course; None where it is none."""
+    if not seen:
+        return None
+    period, sigma = course.period, course.sigma
+    for gain in (_SEARCH_GAIN, _SEARCH_GAIN / 2, _GAIN, _GAIN):
+        cc = ct = nats = rows = dropped = single = steps = 0.0
+        offs = []
+        for count, stamps in seen:
+            known = max(sigma, LEAST_SIGMA)
+            sample, piece, off, cost = follow(count, stamps, period, known, gain, sure * period, _TRACE_ROWS)
+            near = _is_near(off, sigma)
+            sums = piece_sums(stamps[near], sample[near], piece[near], period)
+            cc, ct = cc + sums[:, 3].sum(), ct + sums[:, 4].sum()
+            nats, rows = nats + cost, rows + len(count)
+            step, whole = np.diff(sample)[np.diff(piece) == 0], np.diff(count)[np.diff(piece) == 0]
+            dropped += (np.maximum(whole - step, 0)).sum()
+            single, steps = single + (step == whole).sum(), steps + len(step)
+            offs.append(off)
+        if cc <= 0:
+            return None
+        period = float(ct / cc)
+        sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
+        if not abs(period / course.period - 1) < most_off or sigma > 2 * _MOST_SIGMA:
+            return None
+    fits = sigma < _MOST_SIGMA and dropped <= 2 + _MOST_DROPPED * rows and nats < _MOST_NATS * rows and single > 0.1 * steps
+    return Course(period, sigma, course.observe, course.group, nats / rows, fits)
+
+
+def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
+    """Whether stamps are no outliers: late rows must not pull the period."""
+    return np.asarray(np.abs(off) <= 4 * max(sigma, LEAST_SIGMA))
+
+
+def count_along(rows: Integers, stamps: Integers, course: Course, longest: float) -> tuple[Integers, Integers, Integers]:
+    """Stamps [ns], sample numbers and numbers of the piece of the rows of a block that are looked at, without outliers."""
+    at = observe_rows(stamps, course.observe, course.period)
+    if course.observe != "all":
+        at = at[1:-1]  # the groups at both ends may be cut
+    sample, piece, off, _ = follow(rows[at], stamps[at], course.period, max(course.sigma, LEAST_SIGMA), _GAIN, longest, _TRACE_ROWS)
+    near = _is_near(off, course.sigma)
+    return stamps[at][near], sample[near], piece[near]
+
+
+class _Placer:
+    """Rows to samples, stretch by stretch."""
+
+    def __init__(self, course: Course, period: float, hold: float, max_gap_ns: float):
+        self.course, self.period, self.hold, self.max_gap_ns = course, period, hold, max_gap_ns
+        self.sigma = max(course.sigma, LEAST_SIGMA)
+        self.start: int | None = None
+        self.latest = 0
+        self.last = -1  # sample of the latest row
+        self.runs: list[Integers] = []
+        self.events: list[Integers] = []
+
+    def add(self, rows: Integers, count: Integers, stamps: Integers, n: int) -> None:
+        """Place the first `n` rows of a stretch; the others are what follows."""
+        at = observe_rows(stamps, self.course.observe, self.period)
+        if len(at) == 0:
+            return
+        if self.start is None:
+            self.latest = int(stamps[at[0]])
+        reach = _LATE_SAMPLES * max(self.period, self.course.group * self.period)
+        breaks, self.latest = find_breaks(stamps[at], int(np.searchsorted(at, n)), self.latest, reach, self.max_gap_ns)
+        cuts = [0, *at[breaks[:, 0]].tolist(), n]
+        for number, (begin, end) in enumerate(pairwise(cuts)):
+            beyond = len(rows) if end == n else end
+            if number > 0:
+                self._break(int(rows[begin]), int(breaks[number - 1, 1]), int(stamps[begin]))
+            if begin < end:
+                self._place(rows[begin:beyond], count[begin:beyond], stamps[begin:beyond], end - begin, begins=number > 0)
+
+    def _break(self, row: int, before: int, stamp: int) -> None:
+        elapsed = before - self.origin
+        again = stamp < before and (stamp <= self.origin + 0.1 * elapsed or 2 * (before - stamp) > elapsed)
+        self.events.append(np.array([[RESTART if again else STEP, self.last + 1, row, before, stamp]], dtype=np.int64))
+
+    def _begin(self, count: Integers, stamps: Integers, at: Integers) -> None:
+        """Begin a piece: its first row is the next sample but one, or the first of the log."""
+        ahead = find_phase(count[at], stamps[at], self.period, self.sigma)
+        self.origin = int(stamps[at[0]]) + int(np.rint(ahead * self.period))
+        self.count0, self.level, self.phase, self.seen = int(count[at[0]]), 0, 0.0, 0
+        self.base = int(count[at[0]] - count[0])
+
+    def _anchor(self, level: int) -> None:
+        """Let the piece begin with a row that has lost `level` samples."""
+        self.level = level
+        self.base -= level
+        if self.start is None:
+            self.start = self.origin - int(np.rint(self.base * self.period))
+        else:
+            self.base += self.last + 2
+
+    def _place(self, rows: Integers, count: Integers, stamps: Integers, n: int, *, begins: bool) -> None:
+        at = observe_rows(stamps, self.course.observe, self.period)
+        begins = begins or self.start is None
+        if begins:
+            self._begin(count, stamps, at)
+        levels, phases = np.empty(len(at), dtype=np.int64), np.empty(len(at))
+        if len(at):
+            trace(
+                count[at], stamps[at], self.count0, self.origin, self.period, self.sigma, _GAIN, self.hold,
+                self.max_gap_ns / self.period, self.level, self.phase, self.seen, levels, phases,
+            )  # fmt: skip
+        if begins:
+            self._anchor(int(levels[0]))
+        nearest = np.searchsorted(at, np.arange(n), side="left" if self.course.observe == "last" else "right")
+        nearest -= self.course.observe != "last"
+        known = np.append(levels, self.level if len(at) == 0 else levels[-1])
+        level = np.where(nearest < 0, self.level, known[np.clip(nearest, 0, len(at))])
+        done = int(np.searchsorted(at, n))
+        if done:
+            self.level, self.phase, self.seen = int(levels[done - 1]), float(phases[done - 1]), self.seen + done
+        self._fill(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
+
+    def _fill(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
+        """Give rows their samples; a row that comes to lie on or before the one before it has none."""
+        before = np.maximum.accumulate(np.concatenate([[self.last], sample[:-1]]))
+        kept = sample > before
+        if not kept.all():
+            lost = np.flatnonzero(~kept)
+            same = np.full(len(lost), DUPLICATE)
+            self.events.append(np.stack([same, np.maximum(sample[lost], 0), rows[lost], stamps[lost], stamps[lost]], axis=1))
+            rows, sample = rows[kept], sample[kept]
+        if len(rows):
+            self.last = int(sample[-1])
+            self.runs.append(join_runs(self.runs, sample, rows))
+
+
+def join_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integers:
+    """Make runs of rows and their samples; what continues the last run of `runs` is added to it."""
+    new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
+    first = np.concatenate([[0], new])
+    table = np.stack([sample[first], rows[first], np.diff(np.append(first, len(rows)))], axis=1)
+    before = runs[-1][-1] if runs and len(runs[-1]) else None
+    if before is not None and before[0] + before[2] == table[0, 0] and before[1] + before[2] == table[0, 1]:
+        before[2] += table[0, 2]
+        table = table[1:]
+    return table
+
+
+def place_rows(
+    blocks: Iterator[tuple[Integers, Integers]], course: Course, period: float, *, hold: float, max_gap_ns: float, by_row: bool
+) -> tuple[int | None, list[Integers], list[Integers]]:
+    """Place rows in order along the course of their stamps.
+
+    Parameters
+    ----------
+    blocks : iterator
+        Blocks of (row numbers, stamps [ns]).
+    course : Course
+        How the stamps follow the samples.
+    period : float
+        Sampling period of the grid [ns].
+    hold : float
+        A phase further from zero is turned into a sample left out, or a row dropped [samples].
+    max_gap_ns : float
+        A longer step ahead is a step of the clock [ns].
+    by_row : bool
+        Rows that are left out took their time all the same.
+
+    Returns
+    -------
+    start : int or None
+        Stamp of sample 0 [ns]; None where no stamp is readable.
+    runs, events : list of ndarray
+        As in `gyrostab.ingest.grid.place.Placement`.
+    """
+    ahead = int(min(_AHEAD_ROWS * np.ceil(course.group), _MOST_AHEAD))
+    size = int(min(_TRACE_ROWS * np.ceil(course.group), _MOST_ROWS))
+    placer = _Placer(course, period, hold, max_gap_ns)
+    held = [np.empty(0, dtype=np.int64)] * 3
+    done = 0
+    for rows, stamps in blocks:
+        count = rows if by_row else np.arange(done, done + len(rows))
+        done += len(rows)
+        held = [np.concatenate(pair) for pair in zip(held, (rows, count, stamps), strict=True)]
+        at = 0
+        while len(held[0]) - at >= size + ahead:
+            part = slice(at, at + size + ahead)
+            placer.add(held[0][part], held[1][part], held[2][part], size)
+            at += size
+        held = [column[at:] for column in held]
+    if len(held[0]):
+        placer.add(held[0], held[1], held[2], len(held[0]))
+    return placer.start, placer.runs, placer.events

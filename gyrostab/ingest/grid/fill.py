@@ -1,0 +1,165 @@
+"""Samples from rows: lazy arrays on the grid, NaN where no row was placed."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.ingest.grid.place import Placement
+from gyrostab.ingest.grid.survey import BLOCK
+from gyrostab.kernels.stamps import NO_STAMP, RESTART, STEP
+from gyrostab.store.direct import can_fill, fill_row, held, stretch, with_fill
+from gyrostab.store.threads import in_order
+from gyrostab.time.grid import grid_times
+
+__all__ = ["SMALL", "count_present", "gathered", "on_grid", "samples_of"]
+
+#: Numbers up to which an array is held in memory instead of being computed when needed.
+SMALL = 2_000_000
+
+
+def _fill(rows: NDArray[Any], *, runs: NDArray[np.int64], size: int, scale: float, unit: float | None = None) -> NDArray[np.float64]:
+    """Rows (last dimension) to samples; `runs` count samples and rows from the beginning of both."""
+    out = np.full((*rows.shape[:-1], size), np.nan)
+    for sample, row, length in runs:
+        out[..., sample : sample + length] = rows[..., row : row + length]
+    return _scaled(out, scale, unit)
+
+
+def _scaled(out: NDArray[np.float64], scale: float, unit: float | None) -> NDArray[np.float64]:
+    """The samples themselves, changed: NaN where infinite, times their factor."""
+    out[np.isinf(out)] = np.nan
+    if scale != 1.0:
+        out[...] = out * scale if unit is None else np.rint(out / unit) * (unit * scale)
+    return out
+
+
+def _fill_samples(
+    rows: Any, runs: NDArray[np.int64], ends: NDArray[np.int64], scale: float, unit: float | None,
+    row: int, begin: int, out: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Samples of one row of the grid from `begin` on, as `_fill` makes them: `gyrostab.store.direct.Fill`."""
+    done = 0
+    for sample, first, length in _cut(runs, ends, begin, begin + out.size).tolist():
+        out[done:sample] = np.nan
+        done = sample + length
+        fill_row(rows, row, first, out[sample:done])
+    out[done:] = np.nan
+    _scaled(out, scale, unit)
+
+
+def _cut(runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int) -> NDArray[np.int64]:
+    """Cut out the parts of the runs that lie in the samples from `begin` to `end`."""
+    part = runs[np.searchsorted(ends, begin, side="right") : np.searchsorted(runs[:, 0], end, side="left")]
+    first = np.maximum(part[:, 0], begin)
+    last = np.minimum(part[:, 0] + part[:, 2], end)
+    return np.stack([first - begin, part[:, 1] + first - part[:, 0], last - first], axis=1)
+
+
+def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, unit: float | None = None) -> Any:
+    """Turn an array by row into an array by sample, float64, NaN where there is no row and where a value is infinite.
+
+    Parameters
+    ----------
+    rows : array, shape (..., n_rows)
+        numpy, memmap or dask.
+    placement : Placement
+    chunk : int
+        Samples of a chunk of the result.
+    scale : float
+        Factor on the values.
+    unit : float, optional
+        The values are whole multiples of this; they remain whole multiples of ``unit * scale``, to the last bit.
+
+    Returns
+    -------
+    ndarray or dask.array.Array, shape (..., n_samples)
+        A numpy array when the result is small; chunks that are nothing but gap take no memory until they are computed.
+    """
+    size, lead = placement.size, rows.shape[:-1]
+    if size * max(1, int(np.prod(lead))) <= SMALL:
+        return _fill(np.asarray(rows), runs=placement.runs, size=size, scale=scale, unit=unit)
+    lazy = rows if isinstance(rows, da.Array) else held(np.asarray(rows), BLOCK)
+    ends = placement.runs[:, 0] + placement.runs[:, 2]
+    parts, empty = [], 0
+    filled: list[tuple[int, int]] = []  # chunks that hold samples at all
+
+    def flush() -> None:
+        nonlocal empty
+        if empty:
+            parts.append(da.full((*lead, empty), np.nan, chunks=(*lead, chunk), dtype=np.float64))
+        empty = 0
+
+    for begin in range(0, size, chunk):
+        end = min(size, begin + chunk)
+        runs = _cut(placement.runs, ends, begin, end)
+        if len(runs) == 0:
+            empty += end - begin
+            continue
+        flush()
+        filled.append((begin, end))
+        first, last = int(runs[:, 1].min()), int((runs[:, 1] + runs[:, 2]).max())
+        runs[:, 1] -= first
+        source = lazy[..., first:last].rechunk(-1)
+        shape = (*((n,) for n in lead), (end - begin,))
+        parts.append(source.map_blocks(_fill, runs=runs, size=end - begin, scale=scale, unit=unit, dtype=np.float64, chunks=shape))
+    flush()
+    placed = da.concatenate(parts, axis=-1)
+    placed.gyrostab_filled = filled
+    if not can_fill(lazy) or lazy.dtype != np.float64:
+        return placed
+    return with_fill(placed, partial(_fill_samples, lazy, placement.runs, ends, scale, unit))
+
+
+def count_present(array: Any) -> int:
+    """Count the samples of an array on the grid that are not NaN; chunks that are nothing but gap are not looked at.
+
+    Examples
+    --------
+    >>> count_present(np.array([[1.0, np.nan, 2.0]]))
+    2
+    """
+    filled = getattr(array, "gyrostab_filled", [(begin, begin + BLOCK) for begin in range(0, array.shape[-1], BLOCK)])
+
+    def count(ends: tuple[int, int]) -> int:
+        return int(np.count_nonzero(~np.isnan(stretch(array, *ends))))
+
+    return sum(in_order(count, ((begin, min(end, array.shape[-1])) for begin, end in filled)))
+
+
+def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sample of each row, -1 where the row was not placed."""
+    runs = placement.runs[np.argsort(placement.runs[:, 1], kind="stable")]
+    which = np.searchsorted(runs[:, 1], rows, side="right") - 1
+    inside = (which >= 0) & (rows < runs[which, 1] + runs[which, 2])
+    return np.where(inside, runs[which, 0] + rows - runs[which, 1], -1)
+
+
+def gathered(raw: xr.Dataset, name: str, placement: Placement, rate: float) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
+    """Stamps and values of the filled rows of a slow channel; rows without a sample keep their stamp, moved with their piece."""
+    channel = raw[name].data
+    clock = raw["time"].data if "time" in raw.variables else None
+    breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]
+    breaks = breaks[np.argsort(breaks[:, 2], kind="stable")]
+    moved = np.concatenate([[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]])
+    stamps, values = [], []
+    for begin in range(0, channel.shape[0], BLOCK):
+        block = stretch(channel, begin, min(begin + BLOCK, channel.shape[0])).astype(np.float64, copy=False)
+        rows = np.flatnonzero(np.isfinite(block))
+        sample = samples_of(placement, rows + begin)
+        known = sample >= 0
+        when = grid_times(placement.start, rate, sample)
+        if clock is not None and not known.all():
+            written = stretch(clock, begin, min(begin + BLOCK, channel.shape[0])).astype("datetime64[ns]").view(np.int64)[rows]
+            own = written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
+            when = np.where(known, when, own)
+            known |= written != NO_STAMP
+        stamps.append(when[known])
+        values.append(block[rows][known])
+    time, first = np.unique(np.concatenate(stamps), return_index=True)
+    return time.view("datetime64[ns]"), np.concatenate(values)[first]

@@ -1,0 +1,118 @@
+"""The table of gaps: which samples are missing, and which rows were dropped, moved or could not be read."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import SchemaError
+from gyrostab.ingest.gap_table import CAUSE, FIRST, MOST_GAPS, thinned
+from gyrostab.ingest.grid.fill import samples_of
+from gyrostab.ingest.grid.place import Placement
+from gyrostab.ingest.grid.survey import Survey
+from gyrostab.kernels.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
+from gyrostab.schema import GAP_CAUSES
+
+__all__ = ["find_gaps", "gap_table"]
+
+_MISSING, _UNREADABLE, _OUTSIDE = (GAP_CAUSES.index(name) for name in ("missing", "unreadable", "outside_range"))
+
+
+def _holes(placement: Placement, found: Survey) -> NDArray[np.int64]:
+    """Stretches of samples without a row, between the runs."""
+    runs, events = placement.runs, placement.events
+    end, row_end = runs[:-1, 0] + runs[:-1, 2], runs[:-1, 1] + runs[:-1, 2]
+    start, row_start = runs[1:, 0], runs[1:, 1]
+    told = np.sort(events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2])  # rows whose fate is known otherwise
+    skipped = row_start - row_end - (np.searchsorted(told, row_start) - np.searchsorted(told, row_end))
+    skipped = np.where(row_start > row_end, np.maximum(skipped, 0), 0)
+    broken = events[np.isin(events[:, 0], (STEP, RESTART))]
+    at = np.searchsorted(broken[:, 1], end)
+    at_break = np.zeros(len(end), dtype=bool)
+    cause = np.where(skipped > 0, _UNREADABLE, _MISSING)
+    if len(broken):
+        at = np.minimum(at, len(broken) - 1)
+        at_break = broken[at, 1] == end
+        cause = np.where(at_break, broken[at, 0], cause)
+    listed = (start > end) | ((skipped > 0) & (found.absent <= 0.01 * found.rows))
+    return np.stack([end, start, start - end, skipped, cause], axis=1)[listed]
+
+
+def _cells(spans: NDArray[np.int64], cause: int, placement: Placement) -> NDArray[np.int64]:
+    """Rows that were placed although an axis has no usable number there."""
+    first, last = samples_of(placement, spans[:, 0]), samples_of(placement, spans[:, 1] - 1)
+    kept = (first >= 0) & (last >= first)
+    rows = (spans[:, 1] - spans[:, 0])[kept]
+    return np.stack([first[kept], last[kept] + 1, rows, rows, np.full(len(rows), cause)], axis=1)
+
+
+def _dropped(events: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows dropped or moved; consecutive rows of one cause are one line."""
+    rows = events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER))]
+    rows = rows[np.argsort(rows[:, 2], kind="stable")]
+    if len(rows) == 0:
+        return np.empty((0, 5), dtype=np.int64)
+    new = np.concatenate([[True], (np.diff(rows[:, 2]) > 1) | (np.diff(rows[:, 0]) != 0)])
+    at = np.flatnonzero(new)
+    count = np.diff(np.append(at, len(rows)))
+    sample = np.minimum.reduceat(rows[:, 1], at)
+    return np.stack([sample, sample, np.zeros_like(count), count, rows[at, 0]], axis=1)
+
+
+def find_gaps(placement: Placement, found: Survey, *, most: int = MOST_GAPS) -> NDArray[np.int64]:
+    """Make the table of gaps, in samples.
+
+    Returns
+    -------
+    ndarray of int64, shape (n, 5)
+        First missing sample, first present sample after, samples missing, rows concerned, cause.
+    """
+    table = np.concatenate(
+        [
+            _holes(placement, found),
+            _cells(found.unreadable, _UNREADABLE, placement),
+            _cells(found.infinite, _OUTSIDE, placement),
+            _dropped(placement.events),
+        ]
+    )
+    table = thinned(table, most)
+    return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
+
+
+def gap_table(log: xr.Dataset) -> pd.DataFrame:
+    """List the gaps of a regular log.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        From `regularise`, with the variables ``gap_start``, ``gap_end``, ``gap_samples``, ``gap_rows``, ``gap_cause`` on ``gap``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns start, end (half-open), seconds, samples, rows, cause.
+
+    Raises
+    ------
+    SchemaError
+        When the log has no table of gaps.
+
+    Examples
+    --------
+    >>> from gyrostab.ingest.grid.regularise import regularise
+    >>> time = np.array([0, 10, 20, 50, 60], dtype="datetime64[ms]").astype("datetime64[ns]")
+    >>> raw = xr.Dataset({"rate": (("axis", "row"), np.ones((1, 5)), {"units": "degree hour-1"})}, {"time": ("row", time), "axis": ["z"]})
+    >>> gap_table(regularise(raw))[["seconds", "samples", "rows", "cause"]]
+       seconds  samples  rows    cause
+    0     0.02        2     0  missing
+    """
+    if "gap_start" not in log.variables:
+        raise SchemaError("this log has no table of gaps (gap_start, gap_end, ...); it comes with a log made by gyrostab.regularise")
+    start, end = log["gap_start"].values, log["gap_end"].values
+    cause = np.array(GAP_CAUSES, dtype=object)[log["gap_cause"].values.astype(int)]
+    samples = log["gap_samples"].values
+    rows = log["gap_rows"].values if "gap_rows" in log.variables else np.zeros_like(samples)
+    seconds = (end - start) / np.timedelta64(1, "s")
+    return pd.DataFrame({"start": start, "end": end, "seconds": seconds, "samples": samples, "rows": rows, "cause": cause})

@@ -1,0 +1,107 @@
+"""Stretches of rows that a log holds twice: where the clock is set back and the same samples follow again."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.ingest.grid.fill import samples_of
+from gyrostab.ingest.grid.place import Placement
+from gyrostab.ingest.grid.survey import BLOCK
+from gyrostab.kernels.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
+from gyrostab.store.direct import stretch
+
+__all__ = ["find_repeats", "with_repeats"]
+
+_TRIED = 8  # earlier rows with the stamp of a set-back that are looked at
+_LEAST = 16  # rows; fewer are told from their stamps alone
+_SAME = 0.9  # share of the rows whose values must be alike; a copy may have been damaged
+
+
+def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np.int64]:
+    """Look for the rows after each set-back of the clock among the rows before it.
+
+    Rows are the same when stamps and values are. A clock that starts anew may well write the same stamps, but the values are others;
+    where they never change, nothing can be told, and nothing is taken for a repetition.
+
+    Parameters
+    ----------
+    raw : xarray.Dataset
+        Raw log with stamps.
+    name : str
+        Its signal.
+    placement : Placement
+        Its rows on the grid, with the set-backs of the clock among the events.
+
+    Returns
+    -------
+    ndarray of int64, shape (n, 3)
+        First row of the repetition, first row of what it repeats, number of rows.
+    """
+    events = placement.events
+    back = events[np.isin(events[:, 0], (STEP, RESTART)) & (events[:, 4] < events[:, 3])]
+    found: list[tuple[int, int, int]] = []
+    for row, stamp in sorted(zip(back[:, 2].tolist(), back[:, 4].tolist(), strict=True)):
+        if found and row < found[-1][0] + found[-1][2]:
+            continue
+        for source in _rows_at(raw, stamp, row):
+            length = _same_stamps(raw, source, row)
+            if length >= _LEAST and _same_values(raw, name, source, row, length):
+                found.append((row, source, length))
+                break
+    return np.array(found, dtype=np.int64).reshape(-1, 3)
+
+
+def _stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
+    return stretch(raw["time"].data, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
+
+
+def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
+    """The first few rows with a stamp."""
+    rows: list[int] = []
+    for begin in range(0, before, BLOCK):
+        rows += (np.flatnonzero(_stamps(raw, begin, min(begin + BLOCK, before)) == stamp) + begin).tolist()
+        if len(rows) >= _TRIED:
+            break
+    return rows[:_TRIED]
+
+
+def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
+    """How many rows from `row` on have the stamps of the rows from `source` on, up to the row itself."""
+    room = min(raw.sizes["row"] - row, row - source)
+    for begin in range(0, room, BLOCK):
+        end = min(begin + BLOCK, room)
+        other = np.flatnonzero(_stamps(raw, source + begin, source + end) != _stamps(raw, row + begin, row + end))
+        if len(other):
+            return begin + int(other[0])
+    return room
+
+
+def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int) -> bool:
+    """Whether the values are alike where both are known, and change at all."""
+    told = alike = 0
+    changes = False
+    for begin in range(0, length, BLOCK):
+        end = min(begin + BLOCK, length)
+        left, right = (stretch(raw[name].data, first + begin, first + end) for first in (source, row))
+        known = np.isfinite(left) & np.isfinite(right)
+        rows = known.any(axis=0)
+        told += int(rows.sum())
+        alike += int(((left == right) | ~known).all(axis=0)[rows].sum())
+        changes = changes or bool(((np.diff(left, axis=1) != 0) & known[:, 1:] & known[:, :-1]).any())
+    return changes and told >= 2 and alike >= _SAME * told
+
+
+def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:
+    """Add the rows that are repetitions to the events of a placement that was made without them."""
+    events = [placement.events]
+    for row, source, length in repeats.tolist():
+        rows = np.arange(length)
+        sample = np.maximum.accumulate(np.maximum(samples_of(placement, rows + source), 0))
+        stamps = _stamps(raw, row, row + length)
+        known = stamps != NO_STAMP
+        table = np.stack([np.full(length, DUPLICATE), sample, rows + row, stamps, stamps], axis=1)
+        events.append(table[known])
+    table = np.concatenate(events)
+    return Placement(placement.start, placement.runs, table[np.argsort(table[:, 1], kind="stable")], placement.wander)

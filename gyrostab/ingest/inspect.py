@@ -1,0 +1,205 @@
+"""A look into every column of a file, whether or not it can be read as a gyro log."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import FormatError, GyrostabError
+from gyrostab.ingest.files import _read, scan_file
+from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
+
+__all__ = ["ColumnLook", "FileLook", "look_into"]
+
+#: Columns that are looked into; a log of sensors has tens of them.
+MOST_COLUMNS = 100
+#: Rows that are looked at together.
+CHUNK_ROWS = 2**18
+#: Share of whole numbers above which a column is of counts: junk in the first rows makes no difference.
+WHOLE_SHARE = 0.999
+#: Numbers of this size are fillers: the squares of smaller ones can be summed.
+MOST_SIZE = 1e100
+#: Blocks of a chunk in which the mean step is taken.
+PACES = 64
+# Median of |x - y| of two normal values with one standard deviation: sqrt(2) times 0.6745, the upper quartile of the normal law.
+_MEDIAN_STEP = 0.6745 * math.sqrt(2.0)
+
+
+@dataclass(frozen=True)
+class ColumnLook:
+    """What one column holds; the numbers are in the unit of the file, NaN where the column holds no numbers.
+
+    `scatter` is the standard deviation of a sample about its neighbours, by the median of the steps; `held` is the share of
+    samples equal to the one before, `rising` the share of steps upwards, `pace` the mean step by the median of blocks, `rows` the
+    filled ones, and `rate_hz` how many of them there are in a second, NaN where no time is known.
+    """
+
+    key: str
+    header: str
+    name: str
+    role: str
+    unit: str | None
+    rows: int
+    low: float
+    high: float
+    mean: float
+    std: float
+    scatter: float
+    held: float
+    rising: float
+    whole: bool
+    first: float
+    last: float
+    pace: float
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class FileLook:
+    """What a file holds: its summary, the columns, the rows, and the column of the time where that is known."""
+
+    summary: FileSummary
+    columns: tuple[ColumnLook, ...]
+    rows: int
+    time: ColumnSummary | None
+    rate_hz: float
+    notes: tuple[str, ...] = ()
+
+
+def look_into(path: str | Path, options: ReadOptions | None = None) -> FileLook:
+    r"""Look into every column of a file, in any format that gyrostab reads.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    options : ReadOptions, optional
+        What is known of it; nothing needs to be.
+
+    Returns
+    -------
+    FileLook
+        The columns with range, scatter and rate, up to `MOST_COLUMNS` of them.
+
+    Raises
+    ------
+    FormatError
+        When the file cannot be read at all, or holds no numbers.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = Path(mkdtemp()) / "log.csv"
+    >>> _ = path.write_text("n,wx\n" + "".join(f"{n},{n % 2}\n" for n in range(9)))
+    >>> [(column.key, column.low, column.high) for column in look_into(path).columns]
+    [('n', 0.0, 8.0), ('wx', 0.0, 1.0)]
+    """
+    path, options = Path(path), options or ReadOptions()
+    summary = scan_file(path, options)
+    time = next((column for column in summary.columns if column.role == "time" and column.unit is not None), None)
+    others = [column for column in summary.columns if column is not time]
+    names = {f"column_{place}": column for place, column in enumerate(others[:MOST_COLUMNS])}
+    chosen = {column.key: f"{name} [1]" for name, column in names.items()}
+    chosen.update({column.key: "-" for column in others[MOST_COLUMNS:]})
+    if time is not None:
+        chosen[time.key] = "time" if time.unit == "ISO 8601" else f"time [{time.unit}]"
+        if time.key == "time" and "time" not in options.map:  # stamps of the format, which no option names
+            del chosen[time.key]
+    reading = replace(options, map=chosen, unit={}, rate=1.0, start=None, channels_only=True, channel=(), kind=None)
+    try:
+        log = _read(path, reading)
+    except GyrostabError as error:
+        raise FormatError(str(error)) from error
+    columns = [_look(column, log, name) for name, column in names.items()]
+    if not any(column.rows for column in columns):
+        raise FormatError(f"{path.name}: there is no number in any of its columns; is it a log?")
+    notes = [f"{len(others) - MOST_COLUMNS} further columns are not looked into"] if len(others) > MOST_COLUMNS else []
+    rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
+    return FileLook(summary, tuple(columns), rows, time, _row_rate(log, "row"), tuple(notes))
+
+
+def _row_rate(log: xr.Dataset, dim: str) -> float:
+    """Rows in a second, NaN without stamps."""
+    clock = "time" if dim == "row" else dim
+    if clock not in log.variables or dim not in log.sizes:
+        return math.nan
+    paces = []
+    for start in range(0, log.sizes[dim], CHUNK_ROWS):
+        stamps = np.asarray(log[clock].isel({dim: slice(start, start + CHUNK_ROWS)}).values)
+        good = stamps[~np.isnat(stamps)]
+        if good.size > 1:
+            paces += _paces((good - good[0]) / np.timedelta64(1, "s"))
+    pace = float(np.median(paces)) if paces else math.nan
+    return 1.0 / pace if pace > 0 else math.nan
+
+
+def _paces(values: NDArray[np.float64]) -> list[float]:
+    """Mean step from row to row in each of a few blocks: their median knows of no restarts, gaps and bursts."""
+    blocks = np.array_split(values, min(PACES, max(1, values.size // 8)))
+    return [float((block[-1] - block[0]) / (block.size - 1)) for block in blocks if block.size > 1]
+
+
+def _chunks(variable: xr.DataArray) -> Iterator[NDArray[np.float64]]:
+    dim = str(variable.dims[0])
+    for start in range(0, variable.size, CHUNK_ROWS):
+        values = np.asarray(variable.isel({dim: slice(start, start + CHUNK_ROWS)}).values, dtype=np.float64)
+        yield values[np.abs(values) < MOST_SIZE]
+
+
+def _look(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnLook:
+    counts: dict[str, Any] = dict.fromkeys(("rows", "steps", "same", "up"), 0)
+    low, high, total, squares, origin, first, last, whole = math.inf, -math.inf, 0.0, 0.0, 0.0, math.nan, math.nan, 0
+    scatters: list[tuple[float, int]] = []
+    paces: list[float] = []
+    for values in _chunks(log[name]) if name in log.data_vars else ():
+        if not values.size:
+            continue
+        if counts["rows"] == 0:
+            first = origin = float(values[0])
+        last = float(values[-1])
+        low, high = min(low, float(values.min())), max(high, float(values.max()))
+        total += float((values - origin).sum())
+        squares += float(((values - origin) ** 2).sum())
+        whole += int(np.count_nonzero(values == np.rint(values)))
+        steps = np.diff(values)
+        paces += _paces(values)
+        counts["rows"] += values.size
+        counts["steps"] += steps.size
+        counts["same"] += int((steps == 0).sum())
+        counts["up"] += int((steps > 0).sum())
+        if steps.size:
+            typical = float(np.median(np.abs(steps))) / _MEDIAN_STEP
+            scatters.append((typical or float(np.sqrt(np.mean(steps**2) / 2)), steps.size))  # most samples may be held
+    rows, steps_seen = counts["rows"], max(1, counts["steps"])
+    mean = origin + total / rows if rows else math.nan
+    variance = squares / rows - (total / rows) ** 2 if rows else math.nan
+    scatter = sum(size * weight for size, weight in scatters) / sum(weight for _, weight in scatters) if scatters else math.nan
+    dim = str(log[name].dims[0]) if name in log.data_vars else "row"
+    filled = rows / max(1, log.sizes.get(dim, 1))
+    return ColumnLook(
+        key=column.key or column.header,
+        header=column.header,
+        name=column.name,
+        role=column.role,
+        unit=column.unit,
+        rows=rows,
+        low=low if rows else math.nan,
+        high=high if rows else math.nan,
+        mean=mean,
+        std=math.sqrt(max(0.0, variance)) if rows else math.nan,
+        scatter=scatter,
+        held=counts["same"] / steps_seen,
+        rising=counts["up"] / steps_seen,
+        whole=rows > 0 and whole > WHOLE_SHARE * rows,
+        first=first,
+        last=last,
+        pace=float(np.median(paces)) if paces else math.nan,
+        rate_hz=_row_rate(log, dim) * filled,
+    )

@@ -1,0 +1,114 @@
+"""What the user may say about a log, and what a look at a file tells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gyrostab.errors import OptionError
+from gyrostab.ingest.limits import check_limits
+from gyrostab.time.grid import check_rate, stamp_ns
+
+__all__ = ["ColumnSummary", "FileSummary", "ReadOptions"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """Everything a reader may be told, checked once.
+
+    Parameters
+    ----------
+    rate : float, optional
+        Sampling rate [Hz] of files without a time column; with one, the rate to check against.
+    start : str, optional
+        Stamp of the first row (ISO 8601, UTC) of files without a time column.
+    epoch : str, optional
+        Zero of a numeric time column (ISO 8601, UTC); 1970-01-01 when not given.
+    map : mapping of str to str
+        Header name -> contract name, with a unit if wanted: ``{"wx": "gyro_x [deg/s]"}``. ``""`` or ``"-"`` drops the column.
+        Files without a header row are mapped by column number counted from 0: ``{"1": "gyro_x"}``.
+    unit : mapping of str to str
+        Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time": "us"}``; factors allowed (``"0.1 arcsec/s"``).
+    kind : {"rate", "angle"}, optional
+        How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` the increment of each sample.
+    channel : sequence of path
+        Files that hold further channels.
+    channels_only : bool
+        The file is read for its channels; gyro axes are not asked for.
+    strict : bool
+        A damaged place in a regular log is an error instead of a gap.
+    limits : mapping of str to float
+        Limits of `gyrostab.ingest.limits` with other values.
+
+    Raises
+    ------
+    OptionError
+        When a value makes no sense by itself.
+
+    Examples
+    --------
+    >>> ReadOptions(rate=400.0, unit={"gyro": "deg/s"}).rate
+    400.0
+    """
+
+    rate: float | None = None
+    start: str | None = None
+    epoch: str | None = None
+    map: Mapping[str, str] = field(default_factory=dict)
+    unit: Mapping[str, str] = field(default_factory=dict)
+    kind: str | None = None
+    channel: Sequence[str | Path] = ()
+    channels_only: bool = False
+    strict: bool = False
+    limits: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.rate is not None:
+            check_rate(self.rate, "--rate")
+        if self.kind not in (None, "rate", "angle"):
+            raise OptionError(f"--kind {self.kind}: choose 'rate' (increment of each sample) or 'angle' (cumulative angle)")
+        for name in ("start", "epoch"):
+            value = getattr(self, name)
+            if value is not None:
+                stamp_ns(value, f"--{name}")
+        for name in ("map", "unit"):
+            object.__setattr__(self, name, dict(getattr(self, name) or {}))
+        object.__setattr__(self, "limits", check_limits(self.limits))
+        object.__setattr__(self, "channel", self.channel or ())
+        if isinstance(self.channel, str | Path):
+            object.__setattr__(self, "channel", (self.channel,))
+
+    @property
+    def epoch_ns(self) -> int:
+        """Zero of numeric time [ns since 1970]."""
+        return 0 if self.epoch is None else stamp_ns(self.epoch, "--epoch")
+
+
+@dataclass(frozen=True)
+class ColumnSummary:
+    """One column of a file: how it is called there and how it is understood."""
+
+    header: str
+    name: str
+    role: str  # "time", "gyro", "channel" or "left out"
+    quantity: str | None
+    unit: str | None
+    key: str = ""  # what --map calls it
+
+
+@dataclass(frozen=True)
+class FileSummary:
+    """What a cheap look at a file tells; no stamp or row count is looked for where it would cost a pass over the data."""
+
+    path: Path
+    format: str
+    columns: tuple[ColumnSummary, ...] = ()
+    axes: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
+    first: np.datetime64 | None = None
+    last: np.datetime64 | None = None
+    n_rows: int | None = None
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,137 @@
+"""Files of one recording that overlap: rows that two of them hold are kept once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.schema import SIGNAL_UNITS
+
+__all__ = ["drop_repeats", "stamp_span"]
+
+_BLOCK = 2**20
+_COMPARED = 2**15  # rows at each end of an overlap whose values are compared
+_SAME = 0.9  # share of the compared rows that must be alike; a copy may have been damaged
+
+
+def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+    """Leave out what a file repeats of the files before it.
+
+    Two files overlap when rows of both have the same stamps and the same values. Files whose clocks merely cover the same
+    hours, as after a restart of the clock, have other values and stay as they are.
+
+    Parameters
+    ----------
+    parts : sequence of xarray.Dataset
+        Raw logs with stamps, in the order of their first ones.
+
+    Returns
+    -------
+    list of xarray.Dataset
+        The raw logs without repeated rows, each with a note where rows were left out; a file that holds nothing new is
+        left out as a whole, and the file that holds its rows says so.
+    """
+    kept: list[xr.Dataset] = []
+    ends: list[int] = []
+    for part in parts:
+        first, end = stamp_span(part)
+        for place in reversed(range(len(kept))):
+            held = kept[place]
+            if first > ends[place]:
+                continue
+            tail, head = _rows_from(held, first), _rows_until(part, ends[place])
+            if not _alike(held, part, tail, head):
+                continue
+            if head > held.sizes["row"] - tail and end >= ends[place]:  # it has rows that the earlier file lost
+                kept[place], part = _shorten(held, slice(0, tail), part)
+                ends[place] = first - 1
+            else:
+                part, kept[place] = _shorten(part, slice(head, None), held)
+                first, end = stamp_span(part)
+        kept.append(part)
+        ends.append(end)
+        full = [place for place, one in enumerate(kept) if one.sizes["row"]]
+        kept, ends = [kept[place] for place in full], [ends[place] for place in full]
+    return kept
+
+
+def _shorten(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """The rows of `part` that stay, and `other`, which holds the rest; what was left out stands in the notes of one of them."""
+    name, holder = (str(one.attrs["source_files"][0]) for one in (part, other))
+    shorter = part.isel(row=rows)
+    left_out = part.sizes["row"] - shorter.sizes["row"]
+    if shorter.sizes["row"]:
+        return _with_note(shorter, f"{name}: {left_out} rows are in {holder} too and were left out here"), other
+    return shorter, _with_note(other, f"{holder}: all {left_out} rows of {name} are here too, so that file was left out")
+
+
+def _with_note(part: xr.Dataset, note: str) -> xr.Dataset:
+    return part.assign_attrs(notes=[*part.attrs["notes"], note])
+
+
+def _stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
+    return np.asarray(part["time"][max(begin, 0) : end].values).astype("datetime64[ns]", copy=False).view(np.int64)
+
+
+def stamp_span(part: xr.Dataset) -> tuple[int, int]:
+    """First and latest stamp of a raw log [ns since 1970]."""
+    first, latest = None, NAT
+    for begin in range(0, part.sizes["row"], _BLOCK):
+        stamps = _stamps(part, begin, begin + _BLOCK)
+        latest = max(latest, int(stamps.max()))  # NAT is the least integer
+        if first is None and latest != NAT:
+            first = int(stamps[np.argmax(stamps != NAT)])
+    return (first if first is not None else int(np.iinfo(np.int64).max)), latest
+
+
+def _rows_from(part: xr.Dataset, first: int) -> int:
+    """Row from which the stamps are `first` or later, looked for from the end."""
+    row = part.sizes["row"]
+    while row > 0:
+        stamps = _stamps(part, row - _BLOCK, row)
+        early = np.flatnonzero((stamps < first) & (stamps != NAT))
+        if len(early):
+            return row - len(stamps) + int(early[-1]) + 1
+        row -= len(stamps)
+    return 0
+
+
+def _rows_until(part: xr.Dataset, last: int) -> int:
+    """Number of rows before the first stamp later than `last`."""
+    for begin in range(0, part.sizes["row"], _BLOCK):
+        late = np.flatnonzero(_stamps(part, begin, begin + _BLOCK) > last)
+        if len(late):
+            return begin + int(late[0])
+    return part.sizes["row"]
+
+
+def _alike(held: xr.Dataset, part: xr.Dataset, tail: int, head: int) -> bool:
+    """Whether the rows of `held` from `tail` on and the first `head` rows of `part` are the same samples."""
+    near = _common(held, part, (tail, tail + _COMPARED), (0, min(head, _COMPARED)))
+    size = held.sizes["row"]
+    far = _common(held, part, (max(tail, size - _COMPARED), size), (max(0, head - _COMPARED), head))
+    common, same = (int(a + b) for a, b in zip(near, far, strict=True))
+    return common >= 2 and same >= _SAME * common
+
+
+def _common(held: xr.Dataset, part: xr.Dataset, rows: tuple[int, int], others: tuple[int, int]) -> tuple[int, int]:
+    """How many rows of two stretches have the same stamp, and how many of these the same values; NaN is like anything."""
+    ours, theirs = _stamps(held, *rows), _stamps(part, *others)
+    stamps, a, b = np.intersect1d(ours, theirs, return_indices=True)
+    a, b = a[stamps != NAT], b[stamps != NAT]
+    signal = next((name for name in SIGNAL_UNITS if name in held.data_vars and name in part.data_vars), None)
+    if signal is None or not len(a):
+        return 0, 0
+    axes = [axis for axis in held["axis"].values if axis in part["axis"].values]
+    if not axes:
+        return 0, 0
+    left = np.asarray(held[signal].sel(axis=axes)[:, rows[0] : rows[1]].values)[:, a]
+    right = np.asarray(part[signal].sel(axis=axes)[:, others[0] : others[1]].values)[:, b]
+    known = np.isfinite(left) & np.isfinite(right)
+    close = np.isclose(left, right, rtol=1e-6, atol=0.0) | ~known
+    told = known.any(axis=0)
+    return int(told.sum()), int((close.all(axis=0) & told).sum())

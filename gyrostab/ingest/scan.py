@@ -1,0 +1,374 @@
+"""A table of what is in some logs, before anything is computed from them."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+import xarray as xr
+
+from gyrostab.errors import GyrostabError
+
+if TYPE_CHECKING:
+    from gyrostab.ingest.guess import Guess
+    from gyrostab.ingest.inspect import FileLook
+
+__all__ = ["COLUMNS", "Examined", "Look", "examine", "next_command", "print_look", "print_next", "print_scan", "scan"]
+
+#: Share of missing samples above which the sampling rate may be wrong: it is then tried with the mean rate of the rows.
+MUCH_MISSING = 0.1
+
+#: Columns of the table; span in s, rate in Hz, missing as a share of the samples between start and end.
+COLUMNS = ("file", "format", "start", "end", "span_s", "rate_hz", "axes", "channels", "rows", "gaps", "missing_share", "odd")
+
+
+def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFrame:
+    r"""Say what is in some logs, one row a file.
+
+    Each file is read once, by itself, and put on a uniform time axis to count what is missing.
+
+    Parameters
+    ----------
+    paths : path, pattern, or several of them
+        Logs in any format that gyrostab reads.
+    **reading
+        Options of `gyrostab.run.load_log`: those of `gyrostab.ingest.read_log`, and ``max_gap``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns of `COLUMNS`: file, format, start and end (UTC), span [s], sampling rate [Hz], axes, channels, rows, number of gaps, share
+        of missing samples, and what is odd (for a file that cannot be read, why).
+
+    Raises
+    ------
+    GyrostabError
+        When none of the files can be read: the reason of the first.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "tool.csv"
+    ...     _ = path.write_text("time [s],gyro_x [deg/h]\n" + "".join(f"{n / 10},{n % 3}\n" for n in range(50)))
+    ...     table = scan(path)
+    >>> print(table.loc[0, "rate_hz"], table.loc[0, "axes"], table.loc[0, "rows"])
+    10.0 x 50
+    """
+    examined = examine(paths, look=False, **reading)
+    if examined.errors and len(examined.errors) == len(examined.table):
+        raise examined.errors[0]
+    return examined.table
+
+
+@dataclass(frozen=True)
+class Look:
+    """What was found in a file that cannot be read as it is: its columns, the guess, and the options that read it."""
+
+    paths: list[Path]  # with the same columns; the first was looked into
+    look: FileLook
+    guess: Guess
+    options: dict[str, Any]
+    row: dict[str, Any] | None  # of the table, read with these options
+    error: str | None  # why it cannot be read with them
+
+
+@dataclass(frozen=True)
+class Examined:
+    """The table of `scan`, the errors of files that cannot be read as they are, and a look into them."""
+
+    table: pd.DataFrame
+    errors: list[GyrostabError]
+    looks: list[Look]
+
+
+def examine(paths: Sequence[str | Path] | str | Path, *, look: bool = True, **reading: Any) -> Examined:
+    """Scan logs, and look into each column of those that cannot be read as they are.
+
+    Parameters
+    ----------
+    paths, **reading
+        As for `scan`.
+    look : bool
+        Look into the columns. Of files with the same columns the first is looked into.
+
+    Returns
+    -------
+    Examined
+        Nothing is raised for a file that cannot be read.
+    """
+    from gyrostab.ingest.files import expand
+
+    rows: list[dict[str, Any]] = []
+    errors: list[GyrostabError] = []
+    looks: dict[Any, Look | None] = {}
+    for path in expand(paths):
+        try:
+            rows.append(_scan_one(path, reading))
+        except GyrostabError as error:
+            errors.append(error)
+            found = _look(path, reading, looks) if look else None
+            rows.append({"file": str(path), "odd": str(error)})
+            if found is not None:
+                rows[-1].update(format=found.look.summary.format)
+                rows[-1].update(rows=found.look.rows if found.paths == [path] else None)
+    return Examined(pd.DataFrame(rows, columns=list(COLUMNS)), errors, [found for found in looks.values() if found is not None])
+
+
+def _look(path: Path, reading: dict[str, Any], looks: dict[Any, Look | None]) -> Look | None:
+    """Look into a file, unless one with the same columns was looked into."""
+    from gyrostab.ingest import ReadOptions, scan_file
+    from gyrostab.ingest.guess import guess_columns
+    from gyrostab.ingest.inspect import look_into
+
+    options = ReadOptions(**{name: value for name, value in reading.items() if name not in ("max_gap", "on_file")})
+    try:
+        headers = tuple((column.header, column.role, column.unit) for column in scan_file(path, options).columns)
+        if headers not in looks:
+            looks[headers] = None
+            inside = look_into(path, options)
+            angles = options.kind == "angle"
+            guess = guess_columns(inside, rate=options.rate, rate_hint=_named_rate(path), angles=angles)
+            looks[headers] = _try_guess(path, inside, guess, reading)
+    except GyrostabError:
+        return None
+    found = looks[headers]
+    if found is not None and path not in found.paths:
+        found.paths.append(path)
+    return found
+
+
+def _try_guess(path: Path, look: FileLook, guess: Guess, reading: dict[str, Any]) -> Look:
+    """Read the file by the guess, and with the sampling rate if the stamps alone do not tell it."""
+    from gyrostab.ingest.guess import temperature_unit
+
+    options = {**reading, "map": dict(reading.get("map", {})), "unit": dict(reading.get("unit", {}))}
+    options["map"].update({column.key: f"gyro_{axis}" for axis, column in guess.axes.items() if column.role != "gyro"})
+    if guess.unit is not None:
+        angle = any(column.name.lower().startswith("angle_") for column in guess.axes.values())
+        options["unit"]["angle" if angle else "gyro"] = guess.unit
+    if guess.time is not None:
+        if guess.time.role != "time":
+            options["map"][guess.time.key] = "time"
+        options["unit"]["time"] = guess.time_unit
+    if guess.temperature is not None and guess.temperature.role != "channel":
+        options["map"][guess.temperature.key] = f"temperature [{temperature_unit(guess.temperature)}]"
+    if guess.rate is not None:
+        options["rate"] = guess.rate
+    options = {name: value for name, value in options.items() if value != {}}
+    tries = [options]
+    if "rate" not in options and math.isfinite(look.rate_hz):
+        tries.append({**options, "rate": float(f"{look.rate_hz:.6g}")})
+    reason = "no column looks like a gyro"
+    read: list[Look] = []
+    for trial in tries if guess.axes else []:
+        try:
+            read.append(Look([path], look, guess, trial, _scan_one(path, trial), None))
+        except GyrostabError as error:
+            reason = str(error)
+        if read and read[-1].row is not None and read[-1].row["missing_share"] < MUCH_MISSING:
+            break
+    best = min(read, key=lambda found: found.row["missing_share"] if found.row else 1.0, default=None)
+    return best or Look([path], look, guess, options, None, reason)
+
+
+def _named_rate(path: Path) -> float | None:
+    """A sampling rate that a text at the beginning of a file names, as ``100 Hz``."""
+    from gyrostab.ingest.formats.text import read_head
+
+    found = re.search(r"(?<![\w.])(\d+(?:\.\d+)?) ?(k?)Hz\b", read_head(path), re.IGNORECASE)
+    rate = float(found[1]) * (1000.0 if found[2] else 1.0) if found else 0.0
+    return rate or None
+
+
+def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
+    """The complete command that makes a product of logs.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        The logs.
+    options : dict
+        Options of reading, as `scan` takes them.
+
+    Examples
+    --------
+    >>> next_command(["run 7.csv"], {"map": {"wx": "gyro_x"}, "unit": {"gyro": "deg/s"}})
+    "gyrostab run 'run 7.csv' -o product.nc --map wx=gyro_x --unit gyro=deg/s"
+    """
+    number, target = 2, Path("product.nc")
+    while target.exists():
+        number, target = number + 1, Path(f"product_{number}.nc")
+    words = ["gyrostab", "run", *map(str, paths), "-o", str(target)]
+    for name, value in options.items():
+        flag = {"limits": "--limit"}.get(name, f"--{name.replace('_', '-')}")
+        if isinstance(value, Mapping):
+            for key, text in value.items():
+                words += [flag, f"{key}={text}"]
+        elif isinstance(value, tuple | list):
+            for item in value:
+                words += [flag, str(item)]
+        elif value is True:
+            words.append(flag)
+        else:
+            words += [flag, f"{value:.10g}" if isinstance(value, float) else str(value)]
+    return shlex.join(words)
+
+
+def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
+    from gyrostab.ingest import ReadOptions, read_log, scan_file
+    from gyrostab.ingest.grid.fill import count_present
+    from gyrostab.ingest.grid.regularise import gap_table, regularise
+    from gyrostab.ingest.uniform import cut_log
+    from gyrostab.schema import log_channels, signal_name, texts
+
+    max_gap = reading.get("max_gap", "10D")
+    cut = {name: reading[name] for name in ("time_from", "time_to", "exclude") if name in reading}
+    reading = {name: value for name, value in reading.items() if name not in ("max_gap", "on_file", *cut)}
+    summary = scan_file(path, ReadOptions(**reading))
+    raw = read_log([path], **reading)
+    regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
+    log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits"))
+    log = cut_log(log, **cut)
+    start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
+    signal = log[signal_name(log)]
+    notes = dict.fromkeys(note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *texts(log, "notes")])
+    return {
+        "file": str(path),
+        "format": summary.format,
+        "start": start,
+        "end": end,
+        "span_s": (end.value - start.value) / 1e9,
+        "rate_hz": float(log.attrs["sampling_rate_hz"]),
+        "axes": " ".join(map(str, log["axis"].values)),
+        "channels": " ".join(log_channels(log)),
+        "rows": int(raw.sizes["time" if regular else "row"]),
+        "gaps": len(gap_table(log)) if "gap_start" in log.variables else _count_runs(signal.isnull().all("axis")),
+        "missing_share": 1.0 - count_present(signal.data) / signal.size,
+        "odd": "; ".join(notes),
+    }
+
+
+def _count_runs(missing: xr.DataArray) -> int:
+    """Count the runs of missing samples, for a log without a table of gaps."""
+    return int((missing & ~missing.shift(time=1, fill_value=False)).sum())
+
+
+def print_scan(table: pd.DataFrame) -> None:
+    """Print the table of `scan`: framed on a terminal, plain tab-separated text elsewhere."""
+    if not sys.stdout.isatty():
+        table.to_csv(sys.stdout, sep="\t", index=False)
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    framed = Table()
+    for heading in ("file", "start (UTC)", "span", "rate [Hz]", "axes", "channels", "rows", "gaps", "missing"):
+        framed.add_column(heading, overflow="fold", justify="right" if heading in ("rows", "gaps", "missing") else "left")
+    for _, row in table.iterrows():
+        if pd.isna(row["rate_hz"]):
+            told = "cannot be read" if pd.isna(row["format"]) else "needs options, see below"
+            framed.add_row(escape(row["file"]), f"[red]{told}[/red]")
+            continue
+        cells = (
+            f"{row['file']} ({row['format']})",
+            f"{row['start']:%Y-%m-%d %H:%M:%S}",
+            _span(row["span_s"]),
+            f"{row['rate_hz']:g}",
+            row["axes"],
+            row["channels"],
+            f"{row['rows']:,.0f}",
+            f"{row['gaps']:,.0f}",
+            f"{row['missing_share']:.2%}",
+        )
+        framed.add_row(*map(escape, cells))
+    console.print(framed)
+    for _, row in table[table["odd"].fillna("") != ""].iterrows():
+        console.print(f"[bold]{escape(row['file'])}[/bold]: {escape(row['odd'])}", highlight=False)
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds < 60.0 else str(timedelta(seconds=round(seconds)))
+
+
+LOOK_COLUMNS = ("column", "unit", "low", "high", "mean", "scatter", "rate_hz", "taken_for")
+
+
+def _look_rows(found: Look) -> list[tuple[str, ...]]:
+    """The columns of a file as texts, one row each, as in `LOOK_COLUMNS`."""
+    guess = found.guess
+    taken = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
+    if guess.time is not None:
+        taken[guess.time.key] = "time"
+    if guess.temperature is not None:
+        taken.setdefault(guess.temperature.key, "temperature")
+    rows: list[tuple[str, ...]] = []
+    if found.look.time is not None:
+        time = found.look.time
+        rows.append((time.header, time.unit or "", "", "", "", "", _number(found.look.rate_hz), "time"))
+    for column in found.look.columns:
+        known = math.isfinite(column.rate_hz) or column.rows == 0
+        numbers = (column.low, column.high, column.mean, column.scatter, column.rate_hz if known else guess.sampling_rate_hz)
+        kept = column.name if column.role == "channel" else ""
+        rows.append((column.key, column.unit or "", *map(_number, numbers), taken.get(column.key, kept) if column.rows else "no numbers"))
+    return rows
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if math.isfinite(value) else ""
+
+
+def print_look(found: Look) -> None:
+    """Print what is in the columns of a file and the guess; in a pipe every line begins with ``#``."""
+    rows = _look_rows(found)
+    guess = found.guess
+    told = [*guess.reasons, *(f"check: {warning}" for warning in guess.warnings), *found.look.notes]
+    if found.row is not None:
+        read = found.row
+        told.append(
+            f"read so: {_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes {read['axes']}, {read['missing_share']:.2%} missing"
+        )
+    if found.error is not None and guess.axes:
+        told.append(f"not readable by this guess: {found.error}")
+    if not sys.stdout.isatty():
+        print(f"# {found.paths[0]}: {len(rows)} columns, {found.look.rows} rows")
+        for row in [LOOK_COLUMNS, *rows]:
+            print("# " + "\t".join(row))
+        for text in told:
+            print(f"# {text}")
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    framed = Table(title=escape(f"{found.paths[0]}: {found.look.rows:,} rows"))
+    for heading in LOOK_COLUMNS:
+        framed.add_column(
+            heading.replace("_", " "), overflow="fold", justify="left" if heading in ("column", "unit", "taken_for") else "right"
+        )
+    for row in rows:
+        framed.add_row(*map(escape, row))
+    console = Console()
+    console.print(framed)
+    for text in told:
+        console.print(escape(text), highlight=False)
+
+
+def print_next(command: str, *, apart: bool = False) -> None:
+    """Print the command to run next; with `apart` on stderr if stdout is a pipe, which then holds the plain table only."""
+    if sys.stdout.isatty():
+        print(f"next: {command}")
+    elif apart:
+        print(f"next: {command}", file=sys.stderr)
+    else:
+        print(f"# next: {command}")

@@ -1,0 +1,1 @@
+"""Text logs: their layout, and cells to numbers."""

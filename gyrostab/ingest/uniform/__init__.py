@@ -1,0 +1,7 @@
+"""Logs on a uniform time axis: what xarray leaves of one is brought back onto its grid, or refused, and parts of one are cut out."""
+
+from gyrostab.ingest.uniform.core import as_uniform as as_uniform
+from gyrostab.ingest.uniform.cut import cut_log as cut_log
+from gyrostab.ingest.uniform.cut import parse_instant as parse_instant
+
+__all__ = ["as_uniform", "cut_log", "parse_instant"]

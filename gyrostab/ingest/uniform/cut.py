@@ -1,0 +1,241 @@
+"""The part of a log that is to be used: from one instant to another, without spans that are excluded."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import date
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.ingest.gap_table import clip_table
+from gyrostab.ingest.uniform.core import grid_of
+from gyrostab.ingest.uniform.grid import UniformGrid
+from gyrostab.ingest.uniform.place import place_samples
+from gyrostab.ingest.uniform.table import add_spans, has_gap_table, read_table, with_table
+from gyrostab.schema import GAP_CAUSES, check_log
+from gyrostab.time.clock import time_of_day
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import grid_index, grid_times, stamp_ns
+
+__all__ = ["cut_log", "parse_instant"]
+
+_EXCLUDED = GAP_CAUSES.index("outside_range")
+_EXAMPLE = "2026-11-20T14:00 (UTC) or 10min after the start"
+_SPAN_EXAMPLE = "2026-11-20T14:00/2026-11-20T14:05 or 10min/15min after the start"
+
+_DATE = re.compile(r"\d{4}-?\d")
+
+#: Two ends of a span: text for both, or a pair.
+Span = str | tuple[Any, Any]
+
+
+def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | float:
+    """Read an instant: nanoseconds since 1970 (int) of a date and time, seconds (float) of a duration after the start of the log.
+
+    Parameters
+    ----------
+    value : str, timedelta, datetime or float
+        ISO 8601 text (UTC unless it says otherwise), a duration such as ``"10min"``, a number of seconds after the start.
+    option : str
+        Name of the option, for messages.
+    example : str
+        What would be right, for messages.
+
+    Raises
+    ------
+    OptionError
+        When it is neither.
+
+    Examples
+    --------
+    >>> parse_instant("1970-01-01T00:00:02", "--from"), parse_instant("2min", "--from"), parse_instant("0s", "--from")
+    (2000000000, 120.0, 0.0)
+    """
+    text = value.strip() if isinstance(value, str) else value
+    try:
+        is_date = isinstance(text, date | np.datetime64) or (isinstance(text, str) and bool(_DATE.match(text)))
+        if is_date:
+            return stamp_ns(text, option)
+        if isinstance(text, str) and ":" in text:  # a time of day, of which day is not said
+            raise OptionError(text)
+        if _is_zero(text):
+            return 0.0
+        return duration_seconds(text, option, example=example)
+    except OptionError as error:
+        raise OptionError(f"{option} {value!r} is neither a time nor a duration; write {example}") from error
+
+
+def _is_zero(value: Any) -> bool:
+    try:
+        return pd.Timedelta(value, unit=None if isinstance(value, str) else "s") == pd.Timedelta(0)
+    except (ValueError, TypeError):
+        return False
+
+
+def cut_log(log: xr.Dataset, *, time_from: Any = None, time_to: Any = None, exclude: Span | Sequence[Span] = ()) -> xr.Dataset:
+    """Cut a log to the samples from `time_from` up to, but not including, `time_to`, and take those of excluded spans as missing.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        Regular log, in memory or lazy; what is lazy stays lazy.
+    time_from, time_to : str, datetime or duration, optional
+        Ends of the part that is kept: a date and time (ISO 8601, UTC), or a duration after the first sample of the log.
+    exclude : span or sequence of spans
+        Each ``"START/END"`` or a pair of instants as above. The samples from START up to, but not including, END become NaN on every
+        axis and in every channel.
+
+    Returns
+    -------
+    xarray.Dataset
+        The part, with the table of gaps of that part. An excluded span is a gap of the cause "outside_range".
+
+    Raises
+    ------
+    OptionError
+        When an end cannot be read, lies outside the record, comes before the other end, or nothing is left.
+
+    Examples
+    --------
+    >>> from gyrostab.ingest.make_log import make_log
+    >>> log = make_log([np.arange(10.0)], rate=1.0, unit="deg/h")
+    >>> cut_log(log, time_from="2s", time_to="8s", exclude="3s/5s").rate.values
+    array([[ 2., nan, nan,  5.,  6.,  7.]])
+    """
+    spans: list[Span] = [exclude] if isinstance(exclude, str) or _is_pair(exclude) else list(exclude)  # type: ignore[list-item]
+    if time_from is None and time_to is None and not spans:
+        return log
+    check_log(log)
+    grid, computed = grid_of(log)
+    if not computed:
+        raise SchemaError("the time axis of this log is not computed; bring it onto one first, with gyrostab.ingest.uniform.as_uniform")
+    clock = _Clock(grid)
+    low = 0 if time_from is None else clock.sample_of(time_from, "--from", last=grid.size - 1)
+    high = grid.size if time_to is None else clock.sample_of(time_to, "--to", last=grid.size)
+    if low >= high:
+        raise OptionError(f"nothing is left between --from {time_from} and --to {time_to}; {clock.describe()}")
+    excluded = _merge([clock.span_of(span, low, high) for span in spans])
+    kept = _kept_runs(low, high, excluded)
+    if not len(kept):
+        raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
+    start, size = int(grid_times(grid.start, grid.rate, low)), high - low
+    part = _cut_samples(log, kept, start, grid, low, size)
+    part = _cut_channels(part, grid, low, high, excluded)
+    if has_gap_table(log) or len(excluded):
+        part = with_table(part, _cut_table(log, grid, low, high, excluded), start, grid.rate)
+    return part.assign_attrs(history=_history(log, time_from, time_to, spans, size))
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, tuple) and len(value) == 2 and not any("/" in str(end) for end in value)
+
+
+class _Clock:
+    """Instants to samples of a log."""
+
+    def __init__(self, grid: UniformGrid):
+        self.grid = grid
+
+    def describe(self) -> str:
+        """Say from when to when the record goes."""
+        first, end = (np.datetime64(int(grid_times(self.grid.start, self.grid.rate, n)), "ns") for n in (0, self.grid.size))
+        return f"the record goes from {_short(first)} to {_short(end)} ({self.grid.size / self.grid.rate:.6g} s)"
+
+    def sample_of(self, value: Any, option: str, *, last: int, example: str = _EXAMPLE) -> int:
+        """First sample at or after an instant, which must lie in the record."""
+        sample = self.first_at(value, option, example=example)
+        if sample < 0 or sample > last:
+            raise OptionError(f"{option} {value} lies outside the record; {self.describe()}")
+        return sample
+
+    def first_at(self, value: Any, option: str, *, example: str = _EXAMPLE) -> int:
+        """First sample of the grid, which goes on beyond the ends of the record, at or after an instant."""
+        instant = parse_instant(value, option, example=example)
+        stamp = instant if isinstance(instant, int) else self.grid.start + round(instant * 1e9)
+        sample = int(np.ceil(grid_index(self.grid.start, self.grid.rate, stamp))) - 1  # which rounding may put one too high
+        while int(grid_times(self.grid.start, self.grid.rate, sample)) < stamp:
+            sample += 1
+        return sample
+
+    def span_of(self, span: Span, low: int, high: int) -> tuple[int, int]:
+        """Samples of an excluded span within the part that is kept."""
+        ends = [part.strip() for part in span.split("/")] if isinstance(span, str) else list(span)
+        text = span if isinstance(span, str) else "/".join(map(str, span))
+        if len(ends) != 2 or not all(str(end) for end in ends):
+            raise OptionError(f"--exclude {text!r}: write START/END, for instance {_SPAN_EXAMPLE}")
+        first, end = (self.first_at(value, "--exclude", example=_SPAN_EXAMPLE) for value in ends)
+        if end < first:
+            raise OptionError(f"--exclude {text}: its end comes before its start; write START/END, for instance {_SPAN_EXAMPLE}")
+        if first >= self.grid.size or end <= 0:
+            raise OptionError(f"--exclude {text} lies outside the record; {self.describe()}")
+        return max(first, low), min(end, high)
+
+
+def _short(stamp: np.datetime64) -> str:
+    text = str(stamp)
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def _merge(spans: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
+    """Spans in order, those that touch joined, empty ones left out."""
+    merged: list[list[int]] = []
+    for first, end in sorted(span for span in spans if span[1] > span[0]):
+        if merged and first <= merged[-1][1]:
+            merged[-1][1] = max(merged[-1][1], end)
+        else:
+            merged.append([first, end])
+    return np.array(merged, dtype=np.int64).reshape(-1, 2)
+
+
+def _kept_runs(low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Runs (sample of the part, sample of the log, length) between the excluded spans."""
+    first = np.concatenate([[low], excluded[:, 1]])
+    end = np.concatenate([excluded[:, 0], [high]])
+    kept = end > first
+    return np.stack([first - low, first, end - first], axis=1)[kept]
+
+
+def _cut_samples(log: xr.Dataset, kept: NDArray[np.int64], start: int, grid: UniformGrid, low: int, size: int) -> xr.Dataset:
+    lazy = any(variable.chunks is not None for variable in log.data_vars.values() if "time" in variable.dims)
+    whole = len(kept) == 1 and kept[0, 2] == size
+    if whole and (size == grid.size or not lazy):
+        return log.isel(time=slice(low, low + size))
+    return place_samples(log, kept, start, grid.rate, size)
+
+
+def _cut_channels(part: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]) -> xr.Dataset:
+    """Channels on their own time, cut too."""
+    edges = grid_times(grid.start, grid.rate, np.concatenate([[low, high], excluded.ravel()]))
+    for dim in [dim for dim in part.dims if str(dim).startswith("time_") and dim in part.coords]:
+        stamps = part.variables[dim].values.astype("datetime64[ns]").view(np.int64)
+        keep = (stamps >= edges[0]) & (stamps < edges[1])
+        for first, end in edges[2:].reshape(-1, 2):
+            keep &= (stamps < first) | (stamps >= end)
+        if not keep.all():
+            part = part.isel({dim: np.flatnonzero(keep)})
+    return part
+
+
+def _cut_table(log: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.int64]:
+    table = read_table(log, grid.start, grid.rate) if has_gap_table(log) else None
+    pieces = [np.empty((0, 5), dtype=np.int64)]
+    edges = [low, *excluded.ravel().tolist(), high]
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        if table is not None and end > first:
+            pieces.append(clip_table(table, first, end))
+    cut = add_spans(np.concatenate(pieces), excluded, _EXCLUDED)
+    cut[:, :2] -= low
+    return cut
+
+
+def _history(log: xr.Dataset, time_from: Any, time_to: Any, spans: Sequence[Span], size: int) -> str:
+    given = [f"{name} {value}" for name, value in (("from", time_from), ("to", time_to)) if value is not None]
+    given += [f"without {span if isinstance(span, str) else '/'.join(map(str, span))}" for span in spans]
+    done = f"{time_of_day()} gyrostab.cut_log: {', '.join(given)}: {size} samples"
+    return "\n".join(filter(None, [str(log.attrs.get("history", "")), done]))

@@ -1,7 +1,0 @@
-"""Logs on a uniform time axis: what xarray leaves of one is brought back onto its grid, or refused, and parts of one are cut out."""
-
-from gyrostab.uniform.core import as_uniform as as_uniform
-from gyrostab.uniform.cut import cut_log as cut_log
-from gyrostab.uniform.cut import parse_instant as parse_instant
-
-__all__ = ["as_uniform", "cut_log", "parse_instant"]
