@@ -194,7 +194,7 @@ class Bench:
         target = folder / "product.nc"
 
         def arm() -> None:
-            from gyrostab.run import checkpoint, engine
+            from gyrostab.jobs import checkpoint, engine
 
             engine._HELD_SECONDS = 0.0
             done = []
@@ -345,7 +345,7 @@ def main() -> int:
     parser.add_argument("--write", type=Path)
     given = parser.parse_args()
     os.environ["SOURCE_DATE_EPOCH"] = "1700000000"
-    from gyrostab.davar import davar_parts
+    from gyrostab.allan.davar import davar_parts
 
     davar_parts.__kwdefaults__["samples"] = 1
     with tempfile.TemporaryDirectory() as name:

@@ -20,7 +20,8 @@ import dask
 import numpy as np
 from page import machine, renew
 
-from gyrostab import davar, fit, fit_noise, make_log
+from gyrostab import davar, fit_noise, make_log
+from gyrostab.allan import fit
 from gyrostab.kernels.covariance import diagonal_products
 from gyrostab.kernels.least_squares import fit_windows, identify_noise
 from tests.noise_records import lose, quantization, random_walk, white

@@ -42,7 +42,7 @@ MAP = [f"gyro_{axis}" for axis in AXIS_NAMES]
 _CHILD = """
 import json, resource, sys, time
 def run(path, target, windows, workers):
-    from gyrostab.run import run
+    from gyrostab.jobs.run import run
     run([path], target, windows=windows, overwrite=True, workers=workers)
 def read_xarray(path, target, windows, workers):
     import xarray as xr

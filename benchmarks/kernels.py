@@ -34,7 +34,7 @@ import xarray as xr
 from page import renew
 
 from gyrostab import davar, make_log
-from gyrostab.davar.plan import last_sample, units_of_work
+from gyrostab.allan.plan import last_sample, units_of_work
 from gyrostab.kernels.integrate import present_runs
 from gyrostab.kernels.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace

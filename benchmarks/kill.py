@@ -50,7 +50,7 @@ def start(log: Path, output: Path, *options: str) -> subprocess.Popen[str]:
 _COMMAND = """
 import sys
 if __name__ == "__main__":
-    from gyrostab.davar import davar_parts
+    from gyrostab.allan.davar import davar_parts
     davar_parts.__kwdefaults__["samples"] = 1
     from gyrostab.__main__ import main
     sys.exit(main())

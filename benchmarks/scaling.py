@@ -27,7 +27,7 @@ WINDOW = {"window": "10min", "step": "1min", "taus": "40"}
 _RUN = """
 import json, resource, sys, time
 def work(paths, output, windows, options):
-    from gyrostab.run import run
+    from gyrostab.jobs.run import run
     stages = []
     def stage(label, total=0, done=None, unit="samples"):
         if not stages or stages[-1][0] != label:

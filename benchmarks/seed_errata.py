@@ -18,8 +18,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.davar import davar
-from gyrostab.fit import fit_noise
+from gyrostab.allan.davar import davar
+from gyrostab.allan.fit import fit_noise
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import LAWS, model_avar
 from gyrostab.simulate import simulate

@@ -18,14 +18,12 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gyrostab.confidence import confidence_interval as confidence_interval
+    from gyrostab.allan.confidence import confidence_interval as confidence_interval
+    from gyrostab.allan.davar import davar as davar
+    from gyrostab.allan.fit import fit_noise as fit_noise
     from gyrostab.correlate import correlate as correlate
     from gyrostab.correlate import correlation_rows as correlation_rows
-    from gyrostab.davar import davar as davar
     from gyrostab.diagnose.core import diagnose as diagnose
-    from gyrostab.diagnosis_folder import open_diagnosis as open_diagnosis
-    from gyrostab.diagnosis_folder import write_diagnosis as write_diagnosis
-    from gyrostab.fit import fit_noise as fit_noise
     from gyrostab.ingest import read_channel as read_channel
     from gyrostab.ingest import read_log as read_log
     from gyrostab.ingest.convert import from_dataarray as from_dataarray
@@ -39,7 +37,7 @@ if TYPE_CHECKING:
     from gyrostab.io.datasets import open_surface as open_surface
     from gyrostab.io.datasets import to_netcdf as to_netcdf
     from gyrostab.io.datasets import to_zarr as to_zarr
-    from gyrostab.kalibr import to_kalibr as to_kalibr
+    from gyrostab.io.kalibr import to_kalibr as to_kalibr
     from gyrostab.plot import plot_adev as plot_adev
     from gyrostab.plot import plot_coefficients as plot_coefficients
     from gyrostab.plot import plot_correlation as plot_correlation
@@ -49,24 +47,26 @@ if TYPE_CHECKING:
     from gyrostab.plot import save_figures as save_figures
     from gyrostab.prove import prove as prove
     from gyrostab.report import write_report as write_report
+    from gyrostab.report.diagnosis_folder import open_diagnosis as open_diagnosis
+    from gyrostab.report.diagnosis_folder import write_diagnosis as write_diagnosis
     from gyrostab.simulate import make_noise as make_noise
     from gyrostab.simulate import read_model as read_model
     from gyrostab.simulate import simulate as simulate
 
 # public name -> module that holds it
 _HOME = {
-    "confidence_interval": "confidence",
+    "confidence_interval": "allan.confidence",
     "correlate": "correlate",
     "correlation_rows": "correlate",
-    "davar": "davar",
+    "davar": "allan.davar",
     "diagnose": "diagnose.core",
-    "fit_noise": "fit",
+    "fit_noise": "allan.fit",
     "from_dataarray": "ingest.convert",
     "from_dataframe": "ingest.convert",
     "gap_table": "ingest.grid.regularise",
     "make_log": "ingest.make_log",
     "make_noise": "simulate",
-    "open_diagnosis": "diagnosis_folder",
+    "open_diagnosis": "report.diagnosis_folder",
     "open_log": "io.datasets",
     "open_product": "io.datasets",
     "open_surface": "io.datasets",
@@ -84,10 +84,10 @@ _HOME = {
     "save_figures": "plot",
     "scan": "ingest.scan",
     "simulate": "simulate",
-    "to_kalibr": "kalibr",
+    "to_kalibr": "io.kalibr",
     "to_netcdf": "io.datasets",
     "to_zarr": "io.datasets",
-    "write_diagnosis": "diagnosis_folder",
+    "write_diagnosis": "report.diagnosis_folder",
     "write_report": "report",
 }
 

@@ -24,13 +24,13 @@ WINDOW = {"window": "4000samples", "step": "4000samples", "taus": "12"}
 
 def small_parts() -> None:
     """Make parts of one unit of work, as a long log would be cut into many."""
-    from gyrostab.davar import davar_parts
+    from gyrostab.allan.davar import davar_parts
 
     davar_parts.__kwdefaults__["samples"] = 1
 
 
 def make(log: Path, output: Path, **options: object) -> None:
-    from gyrostab.run import run
+    from gyrostab.jobs.run import run
 
     run([log], output, windows=WINDOW, workers=2, surface_only=True, **options)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.davar import davar
+from gyrostab.allan.davar import davar
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.base import Chunk, Effect, Setup, Windows
 

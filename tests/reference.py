@@ -97,7 +97,7 @@ def fit_window_plainly(
 
     Per term the squared coefficient, its standard error, its estimate free of sign, and the variance of that without the
     term, its growth with the term and with the square of the term; chi-square; the share by which the variances had to be
-    widened at last for a covariance that is positive definite. `tables` are those of `gyrostab.fit`.
+    widened at last for a covariance that is positive definite. `tables` are those of `gyrostab.allan.fit`.
     """
     ok = np.isfinite(y) & (y > 0) & (factor > 0)
     y, white, quantization, ramp, factor = y[ok], white[ok], quantization[ok], ramp[ok], factor[ok]

@@ -12,7 +12,7 @@ from gyrostab.errors import FormatError, MissingUnitError, OptionError
 from gyrostab.ingest import read_log
 from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.io import datasets as export
-from gyrostab.run import load_log
+from gyrostab.jobs.run import load_log
 from tests.regular_logs import RATE, cut, log_of, said, signal
 
 

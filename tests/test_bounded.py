@@ -16,7 +16,7 @@ import xarray as xr
 import zarr
 
 from gyrostab import davar, make_log, read_log, regularise, scan, to_netcdf, to_zarr
-from gyrostab.davar import davar_part
+from gyrostab.allan.davar import davar_part
 from gyrostab.errors import FormatError, OptionError, TimeError
 from gyrostab.ingest import ReadOptions
 from gyrostab.ingest.columns import typed as arrays

@@ -177,7 +177,7 @@ def test_interrupt_is_exit_code_3(log, tmp_path, monkeypatch, capsys):
     def interrupted(*args: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gyrostab.run.core.load_log", interrupted)
+    monkeypatch.setattr("gyrostab.jobs.run.load_log", interrupted)
     assert call("run", log, "-o", tmp_path / "out.nc", *WINDOW) == 3
     assert "interrupted" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
@@ -230,7 +230,7 @@ def test_a_fault_of_ours_is_exit_code_1_without_traceback(log, tmp_path, monkeyp
     def broken(*args: object, **options: object) -> None:
         raise ZeroDivisionError("of all things")
 
-    monkeypatch.setattr("gyrostab.run.core.load_log", broken)
+    monkeypatch.setattr("gyrostab.jobs.run.load_log", broken)
     assert call("run", log, "-o", tmp_path / "out.nc", *WINDOW) == 1
     shown = capsys.readouterr().err
     assert "of all things" in shown

@@ -16,7 +16,7 @@ import xarray as xr
 from gyrostab.errors import OutputError
 from gyrostab.ingest.columns.buffers import Buffers
 from gyrostab.io.datasets import open_log, open_product, to_netcdf
-from gyrostab.run import load_log
+from gyrostab.jobs.run import load_log
 from tests.command_line import RATE, WINDOW, call, stopped, write_log
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.davar import davar
+from gyrostab.allan.davar import davar
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.clusters import cluster_strides
 from gyrostab.kernels.pairs import white_pair_sum

@@ -12,7 +12,7 @@ from gyrostab.cli import main
 from gyrostab.errors import OptionError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.ingest.uniform import cut_log
-from gyrostab.run import load_log
+from gyrostab.jobs.run import load_log
 from tests.reference import direct_surface
 
 START = "2026-03-01T10:00:00"
@@ -183,7 +183,7 @@ def test_commands_take_them(files, tmp_path, capsys):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_run_is_not_continued_with_another_part(files, tmp_path):
-    from gyrostab.run.core import _describe
+    from gyrostab.jobs.run import _describe
 
     names = {
         _describe(files["own"], tmp_path / "p.nc", {"reading": r, "windows": {}, "fitting": {}}).name

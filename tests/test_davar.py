@@ -13,7 +13,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.davar import davar, davar_part, davar_parts
+from gyrostab.allan.davar import davar, davar_part, davar_parts
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.blocks import held_points

@@ -16,9 +16,9 @@ import pytest
 import xarray as xr
 
 from gyrostab.cli import main
-from gyrostab.demo import FILES, find_parts, sample_log
 from gyrostab.errors import SchemaError
 from gyrostab.io.datasets import open_log, open_product
+from gyrostab.jobs.demo import FILES, find_parts, sample_log
 
 pytestmark = pytest.mark.xdist_group("demo")  # one worker, one run of the demo
 

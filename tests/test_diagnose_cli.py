@@ -17,10 +17,10 @@ from gyrostab.diagnose.conclusion.result import check_diagnosis
 from gyrostab.diagnose.core import diagnose, quiet_span
 from gyrostab.diagnose.effects.candidates import Candidate, Variant
 from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnosis_folder import FILES
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import to_netcdf
+from gyrostab.report.diagnosis_folder import FILES
 from gyrostab.simulate import simulate
 
 from .command_line import call

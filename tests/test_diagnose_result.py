@@ -26,10 +26,10 @@ from gyrostab.diagnose.conclusion.sentences import (
     summary,
     unsized_statement,
 )
-from gyrostab.diagnosis_folder import FILES, open_diagnosis, write_diagnosis
 from gyrostab.errors import FormatError, OutputError, SchemaError
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.report import write_diagnosis_report
+from gyrostab.report.diagnosis_folder import FILES, open_diagnosis, write_diagnosis
 from gyrostab.simulate import read_model, simulate
 
 from .command_line import call
@@ -195,7 +195,7 @@ def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.Monkey
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gyrostab.diagnosis_folder.to_netcdf", fail)
+    monkeypatch.setattr("gyrostab.report.diagnosis_folder.to_netcdf", fail)
     with pytest.raises(OutputError):
         write_diagnosis(diagnosis(), tmp_path / "found")
     assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab import make_log, open_product, to_netcdf, to_zarr
-from gyrostab.fit import fit_noise, fit_part
+from gyrostab.allan.fit import fit_noise, fit_part
 from gyrostab.ingest.columns.buffers import lazily
 from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.concat import join_logs
@@ -21,7 +21,8 @@ from gyrostab.ingest.concat.lazy import lay
 from gyrostab.ingest.grid import fill
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.io.datasets import open_log
-from gyrostab.run import checkpoint, load_log, run
+from gyrostab.jobs import checkpoint
+from gyrostab.jobs.run import load_log, run
 from gyrostab.store import deflate, header, read, write
 from gyrostab.store.direct import can_fill, end_to_end, fill_row, held, one_row, stack_rows, stretch
 from gyrostab.store.header import read_header

@@ -18,12 +18,13 @@ import numpy as np
 import pytest
 
 from gyrostab import make_log, to_netcdf, to_zarr
+from gyrostab.allan.davar import davar_parts
 from gyrostab.cli import main
-from gyrostab.davar import davar_parts
 from gyrostab.errors import OptionError, WorkerError
 from gyrostab.io.datasets import open_log
-from gyrostab.run import checkpoint, engine, run
-from gyrostab.run.schedule import Pool, check_scheduler, in_any_order, open_pool
+from gyrostab.jobs import checkpoint, engine
+from gyrostab.jobs.run import run
+from gyrostab.jobs.schedule import Pool, check_scheduler, in_any_order, open_pool
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.xdist_group("distributed")
@@ -105,7 +106,7 @@ def test_two_worker_processes_make_the_same_bytes(address, log, whole, tmp_path)
     with distributed.Client(address) as client:
         seen = client.run(_what_a_worker_knows)
         assert len(seen) == 2
-        assert all("gyrostab.davar" in loaded for loaded, _ in seen.values())
+        assert all("gyrostab.allan.davar" in loaded for loaded, _ in seen.values())
         assert all(threads is None for _, threads in seen.values()), "a kernel has started threads of its own"
 
 
@@ -183,7 +184,7 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
             yield Pool(executor.submit, lambda: 1, True, lambda value: value)
 
     monkeypatch.setattr(engine, "in_any_order", spy)
-    monkeypatch.setattr("gyrostab.run.core.open_pool", elsewhere)
+    monkeypatch.setattr("gyrostab.jobs.run.open_pool", elsewhere)
     sizes = {}
     for samples in (130_000, 1_270_000):
         path = to_netcdf(open_log(log).isel(time=slice(0, samples)), tmp_path / f"log{samples}.nc")
@@ -199,7 +200,7 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
 
 
 def test_no_scheduler_there(log, tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr("gyrostab.run.schedule._TIMEOUT", 1.0)
+    monkeypatch.setattr("gyrostab.jobs.schedule._TIMEOUT", 1.0)
     arguments = ["run", str(log), "-o", str(tmp_path / "p.nc"), "--window", "40s", "--scheduler", "127.0.0.1:9", "--quiet-progress"]
     assert main(arguments) == 2
     shown = capfd.readouterr().err
@@ -215,7 +216,7 @@ def test_a_worker_that_does_not_see_the_files(address, tmp_path):
 
 def _open(address: str, path: Path) -> None:
     """Pretend that the file is there, as it is on another machine's disk."""
-    from gyrostab.run import schedule
+    from gyrostab.jobs import schedule
 
     real = schedule._size
     with pytest.MonkeyPatch.context() as patch:
@@ -225,7 +226,7 @@ def _open(address: str, path: Path) -> None:
 
 
 def test_a_scheduler_without_workers(monkeypatch):
-    monkeypatch.setattr("gyrostab.run.schedule._TIMEOUT", 3.0)
+    monkeypatch.setattr("gyrostab.jobs.schedule._TIMEOUT", 3.0)
     cluster = distributed.LocalCluster(n_workers=0, dashboard_address=":0", processes=True, silence_logs=50)
     with cluster, pytest.raises(WorkerError, match="has no workers; start some with 'dask worker"), open_pool(cluster.scheduler_address):
         pass
@@ -300,7 +301,7 @@ def test_a_part_that_kills_every_worker_is_explained(address):
 def test_worker_processes_end_with_a_killed_parent(tmp_path):
     code = (
         "import os, signal\n"
-        "from gyrostab.run.schedule import in_any_order, open_pool\n"
+        "from gyrostab.jobs.schedule import in_any_order, open_pool\n"
         "if __name__ == '__main__':\n"
         "    with open_pool('processes', workers=1) as pool:\n"
         "        [child] = [found for _, found in in_any_order(pool, [(os.getpid,)])]\n"

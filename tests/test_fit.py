@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from gyrostab import fit
-from gyrostab.confidence import confidence_interval
-from gyrostab.davar import davar
+from gyrostab.allan import fit
+from gyrostab.allan.confidence import confidence_interval
+from gyrostab.allan.davar import davar
+from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.fit import fit_noise
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.covariance import product_tables
 from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
@@ -354,7 +354,7 @@ def test_fast_fit_is_the_plain_fit(law, share, block):
 
 
 def cells_of(x, **options):
-    """Arguments of `fit_windows` for independent windows, and the tables of `gyrostab.fit`."""
+    """Arguments of `fit_windows` for independent windows, and the tables of `gyrostab.allan.fit`."""
     cells, ks, rate, window = fit._inputs(windows_of(x, **options))
     return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._tables(
         tuple(ks.tolist()), (0,) * ks.size, rate, window

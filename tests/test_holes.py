@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.davar import davar
+from gyrostab.allan.davar import davar
 from gyrostab.ingest.make_log import make_log
 
 

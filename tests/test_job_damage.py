@@ -10,7 +10,7 @@ import pytest
 
 from gyrostab import make_log, to_zarr
 from gyrostab.errors import OutputError
-from gyrostab.run.job import begin_job, check_job_folder, make_fingerprint, read_job, remove_damage, seal_store
+from gyrostab.jobs.job import begin_job, check_job_folder, make_fingerprint, read_job, remove_damage, seal_store
 
 
 def flip(content: bytes, place: int, bit: int) -> bytes:

@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab.cli import main
 from gyrostab.errors import OutputError, SchemaError
 from gyrostab.io.datasets import to_netcdf
-from gyrostab.kalibr import KEYS, kalibr_noise, to_kalibr
+from gyrostab.io.kalibr import KEYS, kalibr_noise, to_kalibr
 from gyrostab.schema import OBSERVABLE
 from tests import synthetic
 

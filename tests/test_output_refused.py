@@ -12,8 +12,8 @@ import xarray as xr
 
 from gyrostab import davar, fit_noise, make_log, open_log, to_netcdf, to_zarr
 from gyrostab.errors import GyrostabError, OptionError, OutputError
-from gyrostab.run import run
-from gyrostab.run.job import folder_of
+from gyrostab.jobs.job import folder_of
+from gyrostab.jobs.run import run
 from gyrostab.store.output import check_output, find_foreign_item, new_folder, new_output, protect_inputs
 
 from .command_line import WINDOW, call, write_log

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kurtosis
 
-from gyrostab.davar import davar
+from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import Windows
 from gyrostab.physics.jumps import step_means

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from gyrostab.davar import davar
+from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.physics.registry import effects, make_effect

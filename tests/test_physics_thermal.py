@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.linalg import solve_banded
 
-from gyrostab.davar import davar
+from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
 from gyrostab.kernels.thermal import play, slab
 from gyrostab.noise import LAWS

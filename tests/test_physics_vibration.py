@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from gyrostab.davar import davar
+from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
 from gyrostab.kernels.coloured import band, band_psd, folded_psd, oscillator, oscillator_psd
 from gyrostab.physics.base import Windows

@@ -11,8 +11,8 @@ from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.dates import date2num
 from scipy.stats import chi2
 
+from gyrostab.allan.fit import refit
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.fit import refit
 from gyrostab.noise import LAWS, model_avar
 from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
 from gyrostab.plot.adev import band

@@ -16,11 +16,11 @@ import pytest
 import xarray as xr
 
 from gyrostab import davar, fit_noise, make_log, open_product, to_netcdf
+from gyrostab.allan.davar import davar_part, davar_parts
 from gyrostab.cli import main
-from gyrostab.davar import davar_part, davar_parts
 from gyrostab.io.datasets import open_log
-from gyrostab.run import checkpoint, engine
-from gyrostab.run.job import folder_of, hold
+from gyrostab.jobs import checkpoint, engine
+from gyrostab.jobs.job import folder_of, hold
 from gyrostab.time.grid import time_coordinate
 from tests.crashing import WINDOW
 
@@ -95,7 +95,7 @@ def computed(monkeypatch) -> list[slice]:
         parts.append(part)
         return engine.compute_part(log, part, windows, fitting, space)
 
-    monkeypatch.setattr("gyrostab.run.core.compute_part", counted)
+    monkeypatch.setattr("gyrostab.jobs.run.compute_part", counted)
     return parts
 
 
@@ -275,14 +275,14 @@ def test_changes_refuse_to_resume_and_say_what(log, tmp_path, after_two, monkeyp
     own.write_bytes(log.read_bytes())
     os.utime(own, ns=(stamp, stamp))
     with monkeypatch.context() as patch:
-        patch.setattr("gyrostab.run.job._version", lambda name: "9.9.9")
+        patch.setattr("gyrostab.jobs.job._version", lambda name: "9.9.9")
         refused(expected="gyrostab is 9.9.9, was ")
     assert call(own, "-o", output, "--resume") == 0
 
 
 def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
     from gyrostab import to_zarr
-    from gyrostab.run.job import differences, make_fingerprint
+    from gyrostab.jobs.job import differences, make_fingerprint
 
     store = to_zarr(open_log(log), tmp_path / "run7.zarr")
     before = make_fingerprint([store], {})

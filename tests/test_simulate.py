@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.davar import davar
+from gyrostab.allan.davar import davar
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.ingest.make_log import make_log

@@ -10,13 +10,13 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gyrostab.allan.davar import davar
 from gyrostab.cli import main
-from gyrostab.davar import davar
 from gyrostab.errors import OptionError
 from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_log
-from gyrostab.run import load_log
+from gyrostab.jobs.run import load_log
 from gyrostab.simulate import drivers, simulate
 from gyrostab.time.grid import time_coordinate
 

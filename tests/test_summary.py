@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.cli import main
-from gyrostab.davar.plan import choose_window
-from gyrostab.kernels.outlier_count import count_outliers
-from gyrostab.summary import (
+from gyrostab.allan.plan import choose_window
+from gyrostab.allan.summary import (
     describe_record,
     find_fit_from,
     format_product,
     summarise_fit,
     summarise_terms,
 )
+from gyrostab.cli import main
+from gyrostab.kernels.outlier_count import count_outliers
 from tests import synthetic
 
 RATE = 100.0

@@ -78,7 +78,7 @@ class Reading:
         return {name: value for name, value in self.options().items() if (name, value) != ("max_gap", Reading.max_gap)}
 
     def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.run.load_log`."""
+        """Keyword arguments of `gyrostab.jobs.run.load_log`."""
         chosen = {
             **asdict(self),
             "map": _pairs(self.map, "--map"),
@@ -152,7 +152,7 @@ class Windows:
     axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None
 
     def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.davar.davar`."""
+        """Keyword arguments of `gyrostab.allan.davar.davar`."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -179,7 +179,7 @@ class Fitting:
     fit_to: Annotated[str | None, Parameter(metavar="DURATION")] = None
 
     def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.fit.fit_noise`."""
+        """Keyword arguments of `gyrostab.allan.fit.fit_noise`."""
         return {"terms": self.terms, "method": self.fit_method, "tau_min": self.fit_from, "tau_max": self.fit_to}
 
 

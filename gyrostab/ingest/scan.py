@@ -40,7 +40,7 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     paths : path, pattern, or several of them
         Logs in any format that gyrostab reads.
     **reading
-        Options of `gyrostab.run.load_log`: those of `gyrostab.ingest.read_log`, and ``max_gap``.
+        Options of `gyrostab.jobs.run.load_log`: those of `gyrostab.ingest.read_log`, and ``max_gap``.
 
     Returns
     -------

@@ -330,8 +330,8 @@ def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
     Examples
     --------
     >>> import tempfile
-    >>> from gyrostab.davar import davar
-    >>> from gyrostab.fit import fit_noise
+    >>> from gyrostab.allan.davar import davar
+    >>> from gyrostab.allan.fit import fit_noise
     >>> from gyrostab.ingest.make_log import make_log
     >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
     >>> with tempfile.TemporaryDirectory() as folder:

@@ -58,7 +58,7 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     deviation = np.sqrt(window["avar"].values)
     panel.plot(tau, deviation, color=colour, marker="o", markersize=3.5, linewidth=1.2, label=f"axis {name}, measured")
     if "observable" in window:
-        from gyrostab.fit import refit
+        from gyrostab.allan.fit import refit
 
         estimates = refit(windows).isel(axis=0, time=0)
         _draw_terms(panel, window, estimates, [other for other in COLOURS if other != colour])
@@ -147,7 +147,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
 
 def _name_curve(window: xr.Dataset) -> str:
     """Name the fitted curve, with its misfit."""
-    from gyrostab.fit import is_described
+    from gyrostab.allan.fit import is_described
 
     chi2, dof = float(window["fit_chi2"]), float(window["fit_dof"])
     if not dof > 0:

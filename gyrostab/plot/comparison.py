@@ -74,7 +74,7 @@ def plot_comparison(
     >>> [panel.get_title() for panel in plot_comparison(quiet, loud, window="20s").axes[:4]]
     ['σ with / σ without, windows of 20 s', 'Window mean', 'Power spectrum', 'Allan correlation of x and y']
     """
-    from gyrostab.davar import davar
+    from gyrostab.allan.davar import davar
 
     logs = without, with_it = as_log(without), as_log(with_it)
     shapes = {(signal_name(log), tuple(log["axis"].values), log.sizes["time"]) for log in logs}
@@ -211,7 +211,7 @@ def _coherency(panel: Axes, logs: Any) -> None:
 
 
 def _correlation(panel: Axes, logs: Any) -> None:
-    from gyrostab.davar import davar
+    from gyrostab.allan.davar import davar
 
     for log, style in zip(logs, _STYLES, strict=True):
         x, y = log["rate"].transpose("axis", "time").values[:2]

@@ -105,8 +105,8 @@ def prove(
     >>> proof = gyrostab.prove("proof", cases=20)                                                         # doctest: +SKIP
     >>> print(proof.table)                                                                                # doctest: +SKIP
     """
+    from gyrostab.jobs.job import hold
     from gyrostab.progress import no_stage
-    from gyrostab.run.job import hold
 
     folder, stage, tell = resolve_link(directory), progress or no_stage, say or (lambda text: None)
     salted = 0 if real is None else (cases or _USUAL["cases"]) // _SALTED

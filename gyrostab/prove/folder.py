@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
-from gyrostab.run.job import is_lock
+from gyrostab.jobs.job import is_lock
 from gyrostab.store.output import is_leftover, replace_file
 from gyrostab.store.output.check import check_target
 from gyrostab.store.output.content import read_json

@@ -39,7 +39,7 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
 def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bool:
     """Diagnose a recording, of which nothing but the file is known; whether that succeeded, else `failed` says why."""
     from gyrostab.diagnose.core import diagnose
-    from gyrostab.run import load_log
+    from gyrostab.jobs.run import load_log
 
     try:
         found = diagnose(load_log([recording]), nulls=nulls, seed=int(recording.stem[:7], 16))
@@ -57,7 +57,7 @@ def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[s
     import numpy as np
 
     from gyrostab.concealed import allan_detector, channel_detector
-    from gyrostab.run import load_log
+    from gyrostab.jobs.run import load_log
 
     if target.exists():
         kept: dict[str, bool] = json.loads(target.read_text(encoding="utf-8"))

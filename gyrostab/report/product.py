@@ -17,7 +17,7 @@ from gyrostab.schema import GAP_CAUSES, OBSERVABLE, check_product, texts
 from gyrostab.store.output import new_output
 
 if TYPE_CHECKING:
-    from gyrostab.summary import TermSummary
+    from gyrostab.allan.summary import TermSummary
 
 __all__ = ["write_report"]
 
@@ -54,7 +54,7 @@ def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.D
     check_product(product)
     if log is not None:
         log = as_log(log)
-    from gyrostab.summary import summarise_terms
+    from gyrostab.allan.summary import summarise_terms
 
     terms = summarise_terms(product)
     axes = dict.fromkeys(term.axis for term in terms)
@@ -131,7 +131,7 @@ def _summary(product: xr.Dataset) -> str:
 
 
 def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]) -> list[str]:
-    from gyrostab.summary import describe_record
+    from gyrostab.allan.summary import describe_record
 
     lines = []
     for axis, rows in table:

@@ -151,7 +151,7 @@ def regular_log() -> Any:
 
 def netcdf_seeds() -> Iterator[Seed]:
     from gyrostab.io.datasets import to_netcdf
-    from gyrostab.run import load_log
+    from gyrostab.jobs.run import load_log
 
     for form, row in (("NETCDF3_CLASSIC", "netcdf3"), ("NETCDF3_64BIT_OFFSET", "netcdf3"), ("NETCDF4", "netcdf4")):
         with folder() as place:
@@ -172,7 +172,7 @@ def zarr_seeds() -> Iterator[Seed]:
     import xarray as xr
 
     from gyrostab.io.datasets import to_zarr
-    from gyrostab.run import load_log
+    from gyrostab.jobs.run import load_log
 
     with folder() as place:
         seed = next(text_seeds())
@@ -443,7 +443,7 @@ def option_seeds() -> Iterator[Seed]:
 
 def move_job(data: bytes, old: str, new: str) -> bytes:
     """The job file of a run in another folder; its checksum is made anew if it was right."""
-    from gyrostab.run.job import _hash_json
+    from gyrostab.jobs.job import _hash_json
 
     moved = data.replace(old.encode(), new.encode())
     try:
@@ -463,7 +463,7 @@ def checkpoint_seeds() -> Iterator[Seed]:
     import os
 
     from gyrostab.cli import main
-    from gyrostab.run import core
+    from gyrostab.jobs import run as core
 
     def stop(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt

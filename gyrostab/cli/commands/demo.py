@@ -24,7 +24,7 @@ def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -
     output
         Folder to write into.
     """
-    from gyrostab.demo import format_summary, run_demo
+    from gyrostab.jobs.demo import format_summary, run_demo
 
     with work(common) as stage:
         summary, files = run_demo(output, overwrite=common.overwrite, stage=stage)

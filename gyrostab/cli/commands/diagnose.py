@@ -59,8 +59,8 @@ def diagnose(
     """
     from gyrostab.diagnose.core import diagnose as run_diagnosis
     from gyrostab.diagnose.core import quiet_span
-    from gyrostab.diagnosis_folder import find_foreign_file, write_diagnosis
-    from gyrostab.run import load_log
+    from gyrostab.jobs.run import load_log
+    from gyrostab.report.diagnosis_folder import find_foreign_file, write_diagnosis
     from gyrostab.store.output import check_output
 
     check_output(output, overwrite=common.overwrite, find_foreign=find_foreign_file)

@@ -73,7 +73,7 @@ def ingest(
         (default: zlib).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
-    from gyrostab.run import load_log, samples_of
+    from gyrostab.jobs.run import load_log, samples_of
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)

@@ -36,9 +36,9 @@ def report(
     log
         Log that the product was made of, to show the signal too.
     """
-    from gyrostab.diagnosis_folder import open_diagnosis
     from gyrostab.io.datasets import open_log, open_product
     from gyrostab.report import write_diagnosis_report, write_report
+    from gyrostab.report.diagnosis_folder import open_diagnosis
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite)
@@ -155,7 +155,7 @@ def export(
         kalibr: N, K and B in radians, the worst axis and each of them; zarr: everything.
     """
     from gyrostab.io.datasets import open_product, to_zarr
-    from gyrostab.kalibr import to_kalibr
+    from gyrostab.io.kalibr import to_kalibr
     from gyrostab.store.output import check_output
 
     writers: dict[str, tuple[Any, list[str]]] = {"kalibr": (to_kalibr, [".yaml", ".yml"]), "zarr": (to_zarr, [".zarr"])}

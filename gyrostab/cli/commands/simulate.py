@@ -46,7 +46,7 @@ def simulate(
         Seed of the random numbers: the same log for the same seed, the same noise with and without effects (default: the model's, or 0).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
-    from gyrostab.run import load_log, samples_of
+    from gyrostab.jobs.run import load_log, samples_of
     from gyrostab.simulate import simulate as make
     from gyrostab.store.output import check_output
 

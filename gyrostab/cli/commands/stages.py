@@ -87,7 +87,7 @@ def fit(
     output
         NetCDF file to write.
     """
-    from gyrostab.fit import fit_noise
+    from gyrostab.allan.fit import fit_noise
     from gyrostab.io.datasets import open_surface, to_netcdf
     from gyrostab.store.output import check_output
 
@@ -102,8 +102,8 @@ def _print_product(target: Path) -> None:
     """Print what a product says, the command to run next, and the file."""
     from shlex import quote
 
+    from gyrostab.allan.summary import format_product
     from gyrostab.io.datasets import open_product
-    from gyrostab.summary import format_product
 
     with open_product(target) as product:
         print(format_product(product))
@@ -113,7 +113,7 @@ def _print_product(target: Path) -> None:
 
 def _job(logs: list[Path], output: Path, windows: Windows, reading: Reading, running: Running, common: Common, **more: Any) -> Path:
     """Run the main job with what all its commands let the user choose."""
-    from gyrostab.run import run as run_job
+    from gyrostab.jobs.run import run as run_job
 
     with work(common) as stage:
         return run_job(

@@ -27,11 +27,11 @@ from typing import Literal
 
 import xarray as xr
 
+from gyrostab.allan.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.schema import texts
 from gyrostab.store.output import new_output
-from gyrostab.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
 
 __all__ = ["KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]
 

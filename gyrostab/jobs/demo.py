@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from gyrostab.allan.summary import TermSummary, summarise_terms
 from gyrostab.errors import OutputError, SchemaError
+from gyrostab.jobs.run import load_log, samples_of
 from gyrostab.progress import Stage, no_stage
-from gyrostab.run import load_log, samples_of
-from gyrostab.summary import TermSummary, summarise_terms
 
 __all__ = ["find_parts", "format_summary", "run_demo", "sample_log", "summarise"]
 
@@ -27,7 +27,7 @@ def sample_log() -> Path:
     >>> sample_log().name
     'mwd_sample.csv.gz'
     """
-    here = Path(__file__).resolve().parent
+    here = Path(__file__).resolve().parents[1]
     for folder in (here / "data", here.parent / "data"):
         path = folder / "mwd_sample.csv.gz"
         if path.exists():
@@ -137,8 +137,8 @@ def run_demo(folder: str | Path, *, overwrite: bool = False, stage: Stage = no_s
     OutputError
         When the folder cannot be written to, or holds one of the files and `overwrite` is not given.
     """
-    from gyrostab.davar import davar
-    from gyrostab.fit import fit_noise
+    from gyrostab.allan.davar import davar
+    from gyrostab.allan.fit import fit_noise
     from gyrostab.io.datasets import to_netcdf
     from gyrostab.report import write_report
     from gyrostab.store.output import check_folder, new_folder, protect_inputs

@@ -45,7 +45,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
 
     Examples
     --------
-    >>> from gyrostab.davar import davar
+    >>> from gyrostab.allan.davar import davar
     >>> from gyrostab.ingest.make_log import make_log
     >>> noise = np.random.default_rng(1).standard_normal(6000)
     >>> surface = davar(make_log(noise, rate=100.0, unit="deg/h"), window="60s", taus=[1.0])

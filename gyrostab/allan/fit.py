@@ -95,7 +95,7 @@ def fit_noise(
     --------
     >>> from gyrostab.ingest.make_log import make_log
     >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)  # 6 deg/h at 100 Hz: N = 0.6 / 60 deg/sqrt(h)
-    >>> from gyrostab.davar import davar
+    >>> from gyrostab.allan.davar import davar
     >>> product = fit_noise(davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min"))
     >>> round(float(product.N.mean()), 3)
     0.01
@@ -120,7 +120,7 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
 
     Examples
     --------
-    >>> from gyrostab.davar import davar
+    >>> from gyrostab.allan.davar import davar
     >>> from gyrostab.ingest.make_log import make_log
     >>> log = make_log(np.random.default_rng(1).standard_normal(60_000), rate=100.0, unit="deg/h")
     >>> product = fit_noise(davar(log, window="1min"), terms="NB")
@@ -161,7 +161,7 @@ def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
     Parameters
     ----------
     surface : xarray.Dataset
-        What `gyrostab.davar.davar_part` returns.
+        What `gyrostab.allan.davar.davar_part` returns.
     **options
         Options of `fit_noise`.
 
@@ -172,7 +172,7 @@ def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
 
     Examples
     --------
-    >>> from gyrostab.davar import davar_part
+    >>> from gyrostab.allan.davar import davar_part
     >>> from gyrostab.ingest.make_log import make_log
     >>> log = make_log(np.random.default_rng(1).standard_normal(60_000), rate=100.0, unit="deg/h")
     >>> surface = davar_part(log, part=slice(0, 4), window="1min")

@@ -14,12 +14,10 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
-from gyrostab.kernels.workspace import Workspaces
-from gyrostab.progress import Stage, no_stage
-from gyrostab.run.checkpoint import find_blocks
-from gyrostab.run.checks import check_windows
-from gyrostab.run.engine import Blocks, compute_blocks, compute_part, share_constant, write_blocks
-from gyrostab.run.job import (
+from gyrostab.jobs.checkpoint import find_blocks
+from gyrostab.jobs.checks import check_windows
+from gyrostab.jobs.engine import Blocks, compute_blocks, compute_part, share_constant, write_blocks
+from gyrostab.jobs.job import (
     begin_job,
     check_job_folder,
     clear_job,
@@ -36,7 +34,9 @@ from gyrostab.run.job import (
     remove_job,
     seal_store,
 )
-from gyrostab.run.schedule import Pool, check_scheduler, open_pool
+from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
+from gyrostab.kernels.workspace import Workspaces
+from gyrostab.progress import Stage, no_stage
 from gyrostab.store.output import check_output, protect_inputs, remove_leftovers, resolve_link
 
 __all__ = ["load_log", "run", "samples_of"]
@@ -130,7 +130,7 @@ def run(
     output : path
         NetCDF file to be written.
     reading, windows, fitting : mapping
-        Options of `gyrostab.ingest.read_log`, `gyrostab.davar.davar` and `gyrostab.fit.fit_noise`.
+        Options of `gyrostab.ingest.read_log`, `gyrostab.allan.davar.davar` and `gyrostab.allan.fit.fit_noise`.
     surface_only : bool
         Write the dynamic Allan variance without fitting it.
     overwrite : bool
@@ -293,8 +293,8 @@ def _is_log(path: Path) -> bool:
 
 def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _Begun, pool: Pool, stage: Stage) -> None:
     """Compute what is missing of the job."""
-    from gyrostab.davar import davar_parts
-    from gyrostab.davar.plan import choose_window
+    from gyrostab.allan.davar import davar_parts
+    from gyrostab.allan.plan import choose_window
     from gyrostab.io.datasets import to_zarr
 
     reading, windows, fitting = (job.options[name] for name in ("reading", "windows", "fitting"))

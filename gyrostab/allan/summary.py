@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.fit import is_described, refit
+from gyrostab.allan.fit import is_described, refit
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVABLE, check_product
 

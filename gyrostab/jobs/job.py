@@ -1,6 +1,6 @@
 """The folder of a run beside its output: what the run was asked for, what is finished, and who works on it.
 
-``.PRODUCT.nc.job/`` holds ``job.json`` (inputs, options, versions), a file for each finished block (`gyrostab.run.checkpoint`) and
+``.PRODUCT.nc.job/`` holds ``job.json`` (inputs, options, versions), a file for each finished block (`gyrostab.jobs.checkpoint`) and
 ``lock``. ``job.json`` is there before the first block and is removed first, so that blocks without it are leftovers.
 """
 

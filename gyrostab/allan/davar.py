@@ -14,8 +14,8 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.davar.channels import window_channels
-from gyrostab.davar.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
+from gyrostab.allan.channels import window_channels
+from gyrostab.allan.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.kernels.covariance import diagonal_products

@@ -18,7 +18,7 @@ def check_windows(
     Parameters
     ----------
     window, step, taus, tau_max : str
-        Options of `gyrostab.davar.davar`, as text; others are passed over.
+        Options of `gyrostab.allan.davar.davar`, as text; others are passed over.
 
     Raises
     ------

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.davar import davar_part
-from gyrostab.fit import fit_part
+from gyrostab.allan.davar import davar_part
+from gyrostab.allan.fit import fit_part
 from gyrostab.io.datasets import to_netcdf
+from gyrostab.jobs.checkpoint import Block, assemble, write_block
+from gyrostab.jobs.schedule import Pool, in_any_order
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.progress import Stage
-from gyrostab.run.checkpoint import Block, assemble, write_block
-from gyrostab.run.schedule import Pool, in_any_order
 
 __all__ = ["Blocks", "compute_blocks", "compute_part", "share_constant", "write_blocks"]
 

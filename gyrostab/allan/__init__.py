@@ -1,0 +1,1 @@
+"""Logs to dynamic Allan variance, and from there to the five noise coefficients."""
