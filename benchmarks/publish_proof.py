@@ -15,7 +15,7 @@ from pathlib import Path
 
 from page import renew
 
-from gyrostab.prove.folder import TUNING
+from gyrostab.blindtest.runner.folder import TUNING
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 FIGURES = ("completeness", "reliability")

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.concealed import plan_case
-from gyrostab.concealed.case import make_case
+from gyrostab.blindtest.scenarios.case import make_case
+from gyrostab.blindtest.scenarios.plan import plan_case
 from gyrostab.diagnose.calibration.baseline import calibrate
 from gyrostab.diagnose.effects.candidates import effect_candidates
 from gyrostab.diagnose.effects.cells import begin_state

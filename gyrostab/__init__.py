@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gyrostab.allan.confidence import confidence_interval as confidence_interval
     from gyrostab.allan.davar import davar as davar
     from gyrostab.allan.fit import fit_noise as fit_noise
+    from gyrostab.blindtest.runner.benchmark import prove as prove
     from gyrostab.correlate import correlate as correlate
     from gyrostab.correlate import correlation_rows as correlation_rows
     from gyrostab.diagnose.core import diagnose as diagnose
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from gyrostab.plot import plot_davar_3d as plot_davar_3d
     from gyrostab.plot import plot_signal as plot_signal
     from gyrostab.plot import save_figures as save_figures
-    from gyrostab.prove import prove as prove
     from gyrostab.report import write_report as write_report
     from gyrostab.report.diagnosis_folder import open_diagnosis as open_diagnosis
     from gyrostab.report.diagnosis_folder import write_diagnosis as write_diagnosis
@@ -76,7 +76,7 @@ _HOME = {
     "plot_davar": "plot",
     "plot_davar_3d": "plot",
     "plot_signal": "plot",
-    "prove": "prove",
+    "prove": "blindtest.runner.benchmark",
     "read_channel": "ingest",
     "read_log": "ingest",
     "read_model": "simulate",

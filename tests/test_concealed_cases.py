@@ -12,19 +12,29 @@ import xarray as xr
 from scipy.signal import lfilter
 
 import gyrostab
-from gyrostab.concealed import channel_detector, make_case, open_truth, plan_case, plan_cases, salt, seal
-from gyrostab.concealed.catalogue import CATALOGUE, STRANGE
-from gyrostab.concealed.limits import NATS, amplitude_for, learned_gain, mean_size, shared_size, variance_gain, variance_size
-from gyrostab.concealed.naive import allan_detector
-from gyrostab.concealed.plan import SEVERINGS
-from gyrostab.concealed.record import signal
-from gyrostab.concealed.salt import counts_of
-from gyrostab.concealed.seal import truth_text
-from gyrostab.concealed.sever import sever
-from gyrostab.concealed.shapes import following
-from gyrostab.concealed.visible import FAINT
-from gyrostab.concealed.wander import wander_size
-from gyrostab.concealed.world import AXES, draw_world, stream
+from gyrostab.blindtest.generator.catalogue import CATALOGUE, STRANGE
+from gyrostab.blindtest.generator.detection_limits import (
+    NATS,
+    amplitude_for,
+    learned_gain,
+    mean_size,
+    shared_size,
+    variance_gain,
+    variance_size,
+)
+from gyrostab.blindtest.generator.record import signal
+from gyrostab.blindtest.generator.scenario import AXES, draw_world, stream
+from gyrostab.blindtest.generator.shapes import following
+from gyrostab.blindtest.generator.wander import wander_size
+from gyrostab.blindtest.scenarios import commitment as seal
+from gyrostab.blindtest.scenarios import injection as salt
+from gyrostab.blindtest.scenarios.case import make_case
+from gyrostab.blindtest.scenarios.commitment import open_truth, truth_text
+from gyrostab.blindtest.scenarios.drivers import sever
+from gyrostab.blindtest.scenarios.injection import counts_of
+from gyrostab.blindtest.scenarios.plan import SEVERINGS, plan_case, plan_cases
+from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
+from gyrostab.blindtest.scoring.visibility import FAINT
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.schema import check_log
@@ -122,8 +132,8 @@ def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
     assert red > 2.05  # random walk hides a slow mean, so the same size takes more amplitude
     from scipy import fft
 
-    from gyrostab.concealed.floor import floor_psd
-    from gyrostab.concealed.record import base_noise
+    from gyrostab.blindtest.generator.noise_floor import floor_psd
+    from gyrostab.blindtest.generator.record import base_noise
 
     f = np.arange(1, world.size) * world.rate / 2 / world.size
     density = floor_psd(f, noise=world.noise[0], rate=world.rate) * world.rate
@@ -254,7 +264,7 @@ def test_buried_cases_are_seen_by_neither_eye():
 
 
 def test_a_loud_effect_is_never_called_buried():
-    from gyrostab.concealed.visible import is_buried
+    from gyrostab.blindtest.scoring.visibility import is_buried
 
     world = white_world(seconds=900)
     effect = CATALOGUE["spectral_line"].make(world, np.random.default_rng(0), strength=30.0)

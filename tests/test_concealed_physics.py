@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from gyrostab.concealed import coil, electronics, floor, light, loop, telemetry, tool, vibration
-from gyrostab.concealed.naive import allan_band, allan_variance, band_excess, log_allan, octaves
+from gyrostab.blindtest.generator import coil, electronics, light, loop, telemetry, tool, vibration
+from gyrostab.blindtest.generator import noise_floor as floor
+from gyrostab.blindtest.scoring.baseline_detectors import allan_band, allan_variance, band_excess, log_allan, octaves
 
 
 @pytest.mark.parametrize(("thickness", "diffusivity"), [(0.012, 2.2e-7), (0.007, 3e-7)])

@@ -10,12 +10,12 @@ import pytest
 from scipy import fft
 from scipy.signal import lfilter
 
-from gyrostab.concealed import salt
-from gyrostab.concealed.limits import NATS, mean_size, shared_size, variance_size
-from gyrostab.concealed.measured import _slope, line_density, own_noise
-from gyrostab.concealed.record import make_log
-from gyrostab.concealed.salt import rough_noise
-from gyrostab.concealed.world import draw_world
+from gyrostab.blindtest.generator.detection_limits import NATS, mean_size, shared_size, variance_size
+from gyrostab.blindtest.generator.measured_noise import _slope, line_density, own_noise
+from gyrostab.blindtest.generator.record import make_log
+from gyrostab.blindtest.generator.scenario import draw_world
+from gyrostab.blindtest.scenarios import injection as salt
+from gyrostab.blindtest.scenarios.injection import rough_noise
 
 RATE, SECONDS = 20.0, 1500.0
 

@@ -11,10 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.concealed import by_effect, curves, markdown, missed, reliability, salt_differences, salt_table, score_case, score_table
-from gyrostab.concealed.catalogue import AMBIGUITY, CATALOGUE, merged
-from gyrostab.concealed.score import intersection_over_union
-from gyrostab.concealed.shares import Target, spread, wilson
+from gyrostab.blindtest.generator.catalogue import AMBIGUITY, CATALOGUE, merged
+from gyrostab.blindtest.scoring import curves
+from gyrostab.blindtest.scoring.curves import by_effect, reliability
+from gyrostab.blindtest.scoring.injections import salt_differences, salt_table
+from gyrostab.blindtest.scoring.proportions import Target, spread, wilson
+from gyrostab.blindtest.scoring.score import intersection_over_union, score_case
+from gyrostab.blindtest.scoring.table import markdown, missed, score_table
 from gyrostab.errors import SchemaError
 
 

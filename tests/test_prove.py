@@ -17,16 +17,17 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.concealed import plan_case, score_table
+from gyrostab.blindtest.runner.benchmark import Proof
+from gyrostab.blindtest.runner.folder import TUNING, case_name, read_sums
+from gyrostab.blindtest.runner.outcome import page_text, score_rows
+from gyrostab.blindtest.runner.pool import each_in_processes
+from gyrostab.blindtest.scenarios.plan import plan_case
+from gyrostab.blindtest.scoring.table import score_table
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError, WorkerError
-from gyrostab.prove import Proof
-from gyrostab.prove.folder import TUNING, case_name, read_sums
-from gyrostab.prove.outcome import page_text, score_rows
-from gyrostab.prove.pool import each_in_processes
 
 from .command_line import call
 
-core = importlib.import_module("gyrostab.prove.core")
+core = importlib.import_module("gyrostab.blindtest.runner.benchmark")
 diagnosing = importlib.import_module("gyrostab.diagnose.core")
 
 SMALL = {"rate": 10.0, "seconds": 600, "gaps": 0.0, "cuts": 0, "heavy": False, "severing": None}
@@ -45,7 +46,7 @@ def small_plans(number: int, *, seed: int) -> list[dict]:
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr("gyrostab.concealed.plan_cases", small_plans)
+    monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def finished(tmp_path_factory) -> tuple[Path, list[str], Proof]:
         said.append(f"{text} [{len(list((folder / 'diagnoses').glob('*.json')))} diagnosed]")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gyrostab.concealed.plan_cases", small_plans)
+        patch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
         proof = gyrostab.prove(folder, cases=2, seed=5, nulls=100, workers=0, say=say)
     return folder, said, proof
 
@@ -342,7 +343,8 @@ def test_a_process_that_dies_is_told_with_what_to_do():
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks at processes in /proc")
 def test_no_process_outlives_a_killed_parent():
-    code = "import time\nfrom gyrostab.prove.pool import each_in_processes\neach_in_processes(time.sleep, [(300,), (300,)], workers=2)\n"
+    work = "each_in_processes(time.sleep, [(300,), (300,)], workers=2)"
+    code = f"import time\nfrom gyrostab.blindtest.runner.pool import each_in_processes\n{work}\n"
     parent = subprocess.Popen([sys.executable, "-c", f"if __name__ == '__main__':\n    {code.replace(chr(10), chr(10) + '    ')}"])
     try:
         children = wait_for(lambda: working(parent.pid))

@@ -14,9 +14,10 @@ import pandas as pd
 import pytest
 
 import gyrostab
-from gyrostab.concealed import plan_case, score_table
+from gyrostab.blindtest.runner.folder import TUNING
+from gyrostab.blindtest.scenarios.plan import plan_case
+from gyrostab.blindtest.scoring.table import score_table
 from gyrostab.diagnose.conclusion.result import check_diagnosis
-from gyrostab.prove.folder import TUNING
 
 NUMBER = 5
 
@@ -32,7 +33,7 @@ def test_any_cases_are_diagnosed_sealed_and_counted(tmp_path, monkeypatch, capsy
     seed = int(os.environ.get("GYROSTAB_PROVE_SEED") or TUNING + secrets.randbelow(10**9))
     with capsys.disabled():
         print(f"\nfresh cases of seed {seed}: GYROSTAB_PROVE_SEED={seed} draws them again")
-    monkeypatch.setattr("gyrostab.concealed.plan_cases", short_plans)
+    monkeypatch.setattr("gyrostab.blindtest.plan_cases", short_plans)
     folder = tmp_path / "proof"
     proof = gyrostab.prove(folder, cases=NUMBER, seed=seed, nulls=100, workers=0)
 

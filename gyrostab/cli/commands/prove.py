@@ -53,9 +53,9 @@ def prove(
     resume
         Continue a run that was stopped or killed; begin one where there is none.
     """
-    from gyrostab.concealed import markdown
-    from gyrostab.prove import prove as run_benchmark
-    from gyrostab.prove.folder import TUNING
+    from gyrostab.blindtest.runner.benchmark import prove as run_benchmark
+    from gyrostab.blindtest.runner.folder import TUNING
+    from gyrostab.blindtest.scoring.table import markdown
 
     def say(text: str) -> None:
         print(text, flush=True)

@@ -1,0 +1,269 @@
+"""Effects of supply, light source, feedback loop, logger and telemetry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.signal import lfilter
+
+from gyrostab.blindtest.generator import light, loop, telemetry
+from gyrostab.blindtest.generator.detection_limits import NATS, shared_size
+from gyrostab.blindtest.generator.environment import lag
+from gyrostab.blindtest.generator.noise_floor import white_level
+from gyrostab.blindtest.generator.scenario import AXES, Effect, World, to_samples
+from gyrostab.blindtest.generator.shapes import by_axis, following, mean_effect, named, on_axes, variance_effect
+
+__all__ = [
+    "bias_jump", "feedback_reset", "held_samples", "logger_filter", "shared_source", "spectral_line", "spikes", "supply_bias",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+
+def spectral_line(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+    """A line that stands, or one whose phase wanders slowly."""
+    frequency = float(np.exp(rng.uniform(np.log(0.005), np.log(0.48)))) * world.rate
+    wander = rng.random() < 0.5
+    phase = 2 * math.pi * frequency * np.arange(world.size) / world.rate
+    if wander:
+        phase = phase + np.cumsum(rng.normal(0, math.sqrt(1.0 / (world.seconds * world.rate)), world.size))
+    shares = on_axes(rng)
+    effect = mean_effect(
+        world,
+        np.sin(phase + rng.uniform(0, 6)),
+        shares,
+        strength=strength,
+        name="spectral_line",
+        driver=None,
+        form="sine with a phase that wanders by a radian" if wander else "sine",
+        differs=wander,
+        tau=(max(1 / world.rate, 0.1 / frequency), 2 / frequency),
+        parameters={"frequency": {"value": (phase[-1] - phase[0]) / (2 * math.pi * (world.seconds - 1 / world.rate)), "unit": "Hz"}},
+    )
+    amplitude = float(effect.parameters["peak"]["value"])
+    effect.parameters["amplitude"] = {"values": by_axis(np.abs(shares), amplitude), "unit": "deg/h"}
+    return effect
+
+
+def supply_bias(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Bias that follows the supply, in half of the cases through a regulator that is slow and bends."""
+    slow = rng.random() < 0.5
+    v = world.supply - world.supply.mean()
+    shape = lag(v - 0.3 * np.minimum(v, 0) ** 2, rng.uniform(5, 120)) if slow else v
+    effect = mean_effect(
+        world,
+        to_samples(world, shape),
+        on_axes(rng),
+        strength=strength,
+        name="supply_bias",
+        driver="supply_voltage",
+        form="slow and bent" if slow else "proportional to the voltage",
+        differs=slow,
+        regressor=("voltage", to_samples(world, v), "deg/h/V"),
+    )
+    if slow and effect.mean is not None:  # the diagnosis follows a voltage with a lag, straight
+        found = {axis: following(world, effect.mean[AXES.index(axis)], v, axis=AXES.index(axis)) for axis in effect.axes}
+        effect.parameters["voltage"] = {"values": {axis: slope for axis, (slope, _) in found.items()}, "unit": "deg/h/V"}
+        effect.parameters["lag"] = {"values": {axis: late for axis, (_, late) in found.items()}, "unit": "s"}
+    return effect
+
+
+def bias_jump(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+    """A step at every start after a power cut, in half of the cases with a settling tail."""
+    tail = rng.random() < 0.5
+    t = np.arange(world.temperature.size, dtype=float)
+    shape = np.zeros_like(t)
+    for _, end in world.cuts:
+        jump = rng.choice([-1, 1]) * rng.uniform(0.4, 1.0)
+        settle = 0.3 * np.exp(-np.maximum(t - end, 0) / 60.0) if tail else 0.0
+        shape += np.where(t >= end, jump * (1 + settle), 0.0)
+    return mean_effect(
+        world,
+        to_samples(world, shape),
+        on_axes(rng),
+        strength=strength,
+        name="bias_jump",
+        driver=None,
+        form="step with a settling tail at every start" if tail else "step at every start",
+        differs=tail,
+    )
+
+
+def feedback_reset(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+    """A ramp that falls back by not quite 2 pi: the loop needs a share of the ramp to forget it."""
+    rate = rng.uniform(0.3, 1.0) * min(15.0, 15.0 * world.rate / 8)
+    axis = int(rng.integers(3))
+    wander = 1 + 0.02 * np.sin(2 * math.pi * np.arange(world.size) / world.rate / rng.uniform(100, 900))
+    phase = loop.ramp_phase(rate * wander, dt=1 / world.rate, first=rng.random())
+    settle = rng.uniform(0.03, 0.25)
+    shares = np.zeros(3)
+    shares[axis] = 1.0
+    resets = float(loop.reset_frequency(np.array(rate)))
+    return mean_effect(
+        world,
+        loop.reset_error(phase, settle=settle),
+        shares,
+        strength=strength,
+        name="feedback_reset",
+        driver="ramp",
+        form=f"exponential in the phase of the ramp, {settle:.2f} of it, at {resets:.2f} resets a second",
+        differs=True,
+        tau=(1 / world.rate, 2 / resets),
+        ramp=phase,
+        beside=("dead_zone",) if rate < 0.2 else (),
+    )
+
+
+def _low_passed(rng: np.random.Generator, size: int, *, corner: float) -> Array:
+    lines = fft.rfft(rng.standard_normal(size)) / np.sqrt(1 + (np.arange(size // 2 + 1) / (corner * size / 2)) ** 4)
+    common = fft.irfft(lines, size)
+    return np.asarray(common / common.std())
+
+
+def _level_below(corner: float) -> float:
+    """Level of `_low_passed` noise far below its corner, as an amplitude: what a random walk of the angle at long times has of it."""
+    f = (np.arange(4000) + 0.5) / 4000
+    return float(1 / np.sqrt(np.mean(1 / (1 + (f / corner) ** 4))))
+
+
+def shared_source(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Excess noise of one source in all axes; no axis by itself shows it."""
+    coloured = rng.random() < 0.5
+    corner = rng.uniform(0.3, 0.8) if coloured else 1.0
+    shares = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.6, 1.0, 3)
+    if rng.random() < 0.3:
+        shares[rng.integers(3)] = 0.0
+    pairs = np.array([shares[0] * shares[1], shares[0] * shares[2], shares[1] * shares[2]])
+    rho = min(strength / shared_size(world, pairs), 0.8)
+    shares = shares * math.sqrt(rho)
+    common = _low_passed(rng, world.size, corner=corner) if coloured else rng.standard_normal(world.size)
+    below = _level_below(corner) if coloured else 1.0
+    own = np.stack([rng.standard_normal(world.size) for _ in AXES])
+    size = shared_size(world, rho * pairs)
+    return Effect(
+        name="shared_source",
+        axes=named(shares),
+        driver=None,
+        form=f"common noise low-passed at {corner:.2f} of Nyquist" if coloured else "white common noise",
+        differs=coloured,
+        size=size,
+        nats=NATS * size**2,
+        tau=(1 / world.rate, 30.0),
+        white=light.share_source(own, common, shares=shares),
+        common=shares[:, None] * common,
+        parameters={
+            "correlation": {"value": float(np.abs(rho * pairs).max()), "unit": "1"},
+            "N": {
+                "values": {a: abs(float(r)) * n["N"] * below for a, r, n in zip(AXES, shares, world.noise, strict=True) if r},
+                "unit": "deg/sqrt(h)",
+            },
+        },
+    )
+
+
+def logger_filter(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+    """A short smoothing in the logger that nobody wrote down."""
+    kind = str(rng.choice(["three", "pole", "mean"]))
+
+    def taps(a: float) -> Array:
+        a = min(a, 0.45)
+        return {"three": np.array([a / 2, 1 - a, a / 2]), "pole": (1 - a) * a ** np.arange(25), "mean": np.array([1 - a, a])}[kind]
+
+    f = (np.arange(200) + 0.5) / 200 * math.pi
+
+    def ratio(a: float) -> Array:
+        response = np.exp(-1j * f[:, None] * np.arange(taps(a).size)) @ taps(a)
+        gain = np.maximum(np.abs(response) ** 2, 1e-12)
+        return np.asarray(np.tile(gain / np.exp(np.log(gain).mean()), (3, 1, 1)))  # nobody knows the level before the filter
+
+    effect, amplitude = variance_effect(
+        world,
+        ratio,
+        strength=strength,
+        name="logger_filter",
+        axes=AXES,
+        driver=None,
+        form={"three": "three weights", "pole": "one pole", "mean": "mean of two neighbours, unequal"}[kind],
+        differs=kind != "pole",
+        first=1e-4,
+        tau=(1 / world.rate, 10 / world.rate),
+    )
+    weights = taps(amplitude)
+
+    def after(record: Array) -> Array:
+        first = record[:, :1]
+        return np.asarray(first + lfilter(weights, [weights.sum()], record - first, axis=1))
+
+    parameters = {"weight": {"value": amplitude, "unit": "1"}}
+    if kind == "pole":
+        parameters["cutoff"] = {"value": -math.log(min(amplitude, 0.45)) * world.rate / (2 * math.pi), "unit": "Hz", "unless": ["length"]}
+    return replace(effect, after=after, parameters=parameters)
+
+
+def _sample_sd(world: World, axis: int) -> float:
+    own = world.own
+    return white_level(world.noise[axis]["N"]) * math.sqrt(world.rate) if own is None else float(own.jump[axis])
+
+
+def spikes(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Flipped bits: sizes are powers of two of a step; a spike is worth its chi-square less the places where it could be."""
+    axis = int(rng.integers(3))
+    sd = _sample_sd(world, axis)
+    n = int((~world.missing).sum())
+    number = int(rng.integers(2, 25))
+    worth = NATS * strength**2 / number + math.log(n)
+    lsb = sd * math.sqrt(2 * worth) / 2**12
+    seed = int(rng.integers(2**31))
+
+    def after(record: Array) -> Array:
+        out = record.copy()
+        gone = np.where(world.missing, np.nan, record[axis])
+        flipped, where = telemetry.flip_bits(np.random.default_rng(seed), gone, number=number, lsb=lsb, bit=12)
+        out[axis, where] = flipped[where]
+        return out
+
+    return Effect(
+        name="spikes",
+        axes=(AXES[axis],),
+        driver=None,
+        form=f"{number} flips of bit 12",
+        differs=True,
+        size=strength,
+        nats=NATS * strength**2,
+        tau=(1 / world.rate, 10 / world.rate),
+        after=after,
+        parameters={
+            "spike": {"value": lsb * 2**12, "unit": "deg/h"},
+            "number": {"value": number, "unit": "1"},
+            "per_hour": {"value": number / (n / world.rate / 3600.0), "unit": "1/h"},
+        },
+    )
+
+
+def held_samples(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Frames that come twice, or whose last sample is held; no chance makes a repeat, so the limit is a few of them."""
+    frame = max(3, int(rng.uniform(0.05, 0.4) * world.rate))
+    hold = bool(rng.random() < 0.6)
+    number = max(1, min(round(NATS / math.log(1e3) * strength**2) + 1, world.size // frame // 8))
+    seed = int(rng.integers(2**31))
+    pairs = number * (frame if hold else 1)
+    seen = telemetry.repeat_frames(np.random.default_rng(seed), np.zeros((1, world.size)), number=number, frame=frame, hold=hold)[1]
+    seen = seen[~world.missing[seen]]
+    hours = float((~world.missing).sum()) / world.rate / 3600.0
+    held = {"per_hour": {"value": seen.size / hours, "unit": "1/h"}, "length": {"value": frame / world.rate, "unit": "s"}}
+    return Effect(
+        name="held_samples",
+        axes=AXES,
+        driver=None,
+        form=f"{number} frames of {frame} samples " + ("held" if hold else "sent twice"),
+        differs=not hold,
+        size=strength,
+        nats=float(pairs) * math.log(1e3),
+        tau=(1 / world.rate, 2 * frame / world.rate),
+        after=lambda record: telemetry.repeat_frames(np.random.default_rng(seed), record, number=number, frame=frame, hold=hold)[0],
+        parameters={"number": {"value": int(seen.size), "unit": "1"}, "frame": {"value": frame, "unit": "1"}} | (held if hold else {}),
+    )

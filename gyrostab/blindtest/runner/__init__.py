@@ -1,0 +1,1 @@
+"""The run of the blind test: draw, commit, diagnose, score, publish."""

@@ -1,0 +1,106 @@
+"""Which real recordings are salted, with what, and how each is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.blindtest.generator.scenario import stream
+from gyrostab.blindtest.scenarios.injection import salt
+
+__all__ = ["COPIES", "REAL", "make_salted", "plan_salted"]
+
+#: The salted recording, and its copies without salt.
+COPIES = ("salted", "untouched", "flipped", "reversed")
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """File in the folder of recordings, columns and units, and the longest piece that is taken [s]."""
+
+    file: str
+    columns: dict[str, str]
+    units: dict[str, str] = field(default_factory=dict)
+    longest: float = 900.0
+    rate: float | None = None  # where the file has no times
+
+
+REAL: dict[str, _Recording] = {
+    "fog-blueseis": _Recording("fog-blueseis-ramp/fog_ramp.csv.gz", {"rate_counts": "gyro_z"}, {"gyro": "1 nrad/s"}),
+    "laser-gyros": _Recording(
+        "rlg-static-30min/lasergyro.csv.gz",
+        {"gx_deg_per_h": "gyro_x", "gy_deg_per_h": "gyro_y", "gz_deg_per_h": "gyro_z"},
+        {"gyro": "deg/h"},
+    ),
+    "mems-ch104": _Recording(
+        "mems-static-53min/ch104.csv.gz", {"gx_dps": "gyro_x", "gy_dps": "gyro_y", "gz_dps": "gyro_z"}, {"gyro": "deg/s"}, 1200.0, 100.0
+    ),
+    "ring-laser-g": _Recording("ringlaser-g-3h/ringlaser_g_3h.nc", {"BJZ": "gyro_z"}, {"gyro": "1.5825038e-13 rad/s"}, 2400.0),
+}
+
+#: Effects that can be added to noise which is there already, on one axis; and those which need three.
+_ON_ONE = (
+    "vibration_rectification", "shupe", "temperature_bias", "thermal_hysteresis", "vibration_noise", "aliased_vibration",
+    "temperature_noise", "light_power_noise", "ageing_noise", "spectral_line", "supply_bias", "spikes",
+)  # fmt: skip
+_ON_THREE = (*_ON_ONE, "shared_source", "earth_rate", "scale_factor")
+
+_STRENGTHS = (1.5, 2.5, 4.0, 8.0)
+
+
+def plan_salted(number: int, *, seed: int) -> list[dict[str, Any]]:
+    """Plans of `number` salted real recordings, four for each: salted, untouched, turned in sign, turned in time.
+
+    Examples
+    --------
+    >>> [plan["copy"] for plan in plan_salted(1, seed=3)]
+    ['salted', 'untouched', 'flipped', 'reversed']
+    """
+    out = []
+    for index in range(number):
+        rng = stream(seed, "salted", index)
+        names = list(REAL)
+        recording = names[(int(stream(seed, "salted").integers(len(names))) + index) % len(names)]
+        effects = _ON_THREE if sum(name.startswith("gyro") for name in REAL[recording].columns.values()) == 3 else _ON_ONE
+        plan = {"index": index, "seed": seed, "recording": recording, "effect": str(rng.choice(effects))}
+        plan |= {"strength": float(rng.choice(_STRENGTHS)), "part": float(rng.random())}
+        out += [plan | {"kind": "salted" if copy == "salted" else "control", "copy": copy} for copy in COPIES]
+    return out
+
+
+def _piece(recording: str, folder: Path, part: float) -> xr.Dataset:
+    from gyrostab.ingest import read_log
+    from gyrostab.ingest.grid.regularise import regularise
+
+    entry = REAL[recording]
+    log = regularise(read_log(folder / entry.file, map=entry.columns, unit=entry.units, rate=entry.rate))
+    size = min(log.sizes["time"], round(entry.longest * float(log.attrs["sampling_rate_hz"])))
+    first = round(part * (log.sizes["time"] - size))
+    piece = log[["rate"]].isel(time=slice(first, first + size)).compute()
+    piece.attrs = {name: log.attrs[name] for name in ("sampling_rate_hz", "kind")}  # nothing that tells where it comes from
+    return piece
+
+
+def make_salted(plan: dict[str, Any], folder: Path) -> tuple[xr.Dataset, dict[str, Any]]:
+    """Make one of the four logs of a salted recording and its truth.
+
+    Parameters
+    ----------
+    plan : dict
+        One of `plan_salted`.
+    folder : pathlib.Path
+        Where the real recordings are.
+
+    Raises
+    ------
+    FormatError
+        When the recording is not there.
+    """
+    log = _piece(plan["recording"], folder, plan["part"])
+    rng = np.random.default_rng(stream(plan["seed"], "salt", plan["index"]).integers(2**40))
+    made, truth = salt(log, plan["effect"], plan["strength"], rng)[plan["copy"]]
+    return made, truth | {"plan": plan}

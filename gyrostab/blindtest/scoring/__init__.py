@@ -1,0 +1,1 @@
+"""Scores of a diagnosis against the ground truth, beside those of two baseline detectors."""
