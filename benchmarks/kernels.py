@@ -35,8 +35,8 @@ from page import renew
 
 from gyrostab import davar, make_log
 from gyrostab.allan.plan import last_sample, units_of_work
-from gyrostab.kernels.integrate import present_runs
-from gyrostab.kernels.surface import Unit, surface_unit
+from gyrostab.kernels.allan.integrate import present_runs
+from gyrostab.kernels.allan.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.time.durations import averaging_factors, thin
 

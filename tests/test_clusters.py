@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from gyrostab.allan.davar import davar
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.clusters import cluster_strides
-from gyrostab.kernels.pairs import white_pair_sum
+from gyrostab.kernels.allan.clusters import cluster_strides
+from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.schema import ESTIMATORS
 from tests.reference import cluster_cell
 

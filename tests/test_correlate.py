@@ -17,7 +17,7 @@ import gyrostab
 from gyrostab.cli import main
 from gyrostab.correlate.judge import VERDICTS
 from gyrostab.errors import OptionError, TimeError
-from gyrostab.kernels.coupling import averages, beside, calibrated, decompose, fit_lags, slope_interval, uncalibrated
+from gyrostab.kernels.regression.coupling import averages, beside, calibrated, decompose, fit_lags, slope_interval, uncalibrated
 from tests import coupled, synthetic
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from gyrostab.allan.davar import davar, davar_part, davar_parts
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.blocks import held_points
-from gyrostab.kernels.surface import Unit, surface_unit
+from gyrostab.kernels.allan.blocks import held_points
+from gyrostab.kernels.allan.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.schema import ESTIMATORS
 from gyrostab.store.direct import held

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.kernels.integrate import integrate, present_runs, pyramid_places, thin_pyramid
-from gyrostab.kernels.surface import Unit, surface_unit
-from gyrostab.kernels.vectors import IN_A_ROW, LANES, split_sums
+from gyrostab.kernels.allan.integrate import integrate, present_runs, pyramid_places, thin_pyramid
+from gyrostab.kernels.allan.surface import Unit, surface_unit
+from gyrostab.kernels.allan.vectors import IN_A_ROW, LANES, split_sums
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.time.durations import thin
 

@@ -15,8 +15,8 @@ from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views.cells import cube_root_score
 from gyrostab.diagnose.views.davar import allan_surface
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.expected import expected_powers
-from gyrostab.kernels.periodogram import band_edges, ordinates, taper
+from gyrostab.kernels.spectra.expected import expected_powers
+from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import URAD_PER_S
 from gyrostab.simulate import simulate
 from gyrostab.simulate.noise import make_noise

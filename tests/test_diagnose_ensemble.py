@@ -13,7 +13,7 @@ from gyrostab.diagnose.gains.gain import mean_gains, power_gains
 from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.reduction.outliers import CHANCE
 from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.kernels.periodogram import band_covariance
+from gyrostab.kernels.spectra.periodogram import band_covariance
 from gyrostab.simulate import simulate
 
 NOISE = {"Q": 0.05, "N": 0.003, "B": 0.004, "K": 0.02}

@@ -19,7 +19,7 @@ from gyrostab.diagnose.locating.ensemble import null_records
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.state_space import flicker_states
+from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.noise import HOUR
 from tests.test_state_space import relaxation_covariance, walk_covariance
 

@@ -12,7 +12,7 @@ from scipy import stats
 from gyrostab.diagnose.reduction.reduced import block_samples, reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.periodogram import band_covariance, band_edges, ordinates, taper
+from gyrostab.kernels.spectra.periodogram import band_covariance, band_edges, ordinates, taper
 from gyrostab.noise import URAD_PER_S
 from gyrostab.simulate import simulate
 

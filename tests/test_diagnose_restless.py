@@ -17,7 +17,7 @@ from gyrostab.diagnose.locating.null_scores import null_scores, standardise
 from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views import gliding, restless, spectrum
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.periodogram import taper
+from gyrostab.kernels.spectra.periodogram import taper
 from tests.reduced_records import baseline, chunks, records
 
 SMALL = {"rate": 10.0, "blocks": 120}

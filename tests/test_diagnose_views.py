@@ -15,7 +15,7 @@ from gyrostab.diagnose.reduction.reduced import reduce_log
 from gyrostab.diagnose.views import VIEWS, cross_axis, davar, distribution, locked, mean, restart, spectrum
 from gyrostab.diagnose.views.cells import cube_root_score, exponential_score, over_windows, window_set
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
+from gyrostab.kernels.regression.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
 from gyrostab.noise import LAWS
 from tests.reduced_records import BLOCK_S, RATE, baseline, chunks, records
 

@@ -8,8 +8,8 @@ from numba import njit
 from scipy.optimize import nnls
 
 from gyrostab.kernels.compiled import KERNEL
-from gyrostab.kernels.eight_solvers import back_substitute, eliminate, solve_nonnegative_eights
-from gyrostab.kernels.eights import eights, put, root, take, where_above
+from gyrostab.kernels.fit.eight_solvers import back_substitute, eliminate, solve_nonnegative_eights
+from gyrostab.kernels.fit.eights import eights, put, root, take, where_above
 
 COMPILED = {**KERNEL, "cache": False}
 

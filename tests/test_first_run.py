@@ -9,7 +9,7 @@ import sys
 FIT = """
 import hashlib
 import numpy as np
-from gyrostab.kernels.least_squares import fit_windows
+from gyrostab.kernels.fit.least_squares import fit_windows
 
 n, windows, rng = 24, 60, np.random.default_rng(1)
 tau = np.geomspace(1.0, 1e3, n)

@@ -18,11 +18,11 @@ from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.covariance import product_tables
-from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
-from gyrostab.kernels.limits import cell_limits, interpolate_quantile
-from gyrostab.kernels.nonnegative import solve_nonnegative
-from gyrostab.kernels.pairs import white_pair_sum
+from gyrostab.kernels.allan.pairs import white_pair_sum
+from gyrostab.kernels.fit.covariance import product_tables
+from gyrostab.kernels.fit.least_squares import FIT_FIELDS, fit_windows
+from gyrostab.kernels.fit.limits import cell_limits, interpolate_quantile
+from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import OBSERVABLE
 from tests.noise_records import flicker, lose, quantization, random_walk, white

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numcodecs import Fletcher32
 
-from gyrostab.kernels.checksum import fletcher32
+from gyrostab.kernels.encoding.checksum import fletcher32
 
 
 def by_numcodecs(data: np.ndarray) -> int:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.kernels.levels import level_tables, levels_smooth
+from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
 
 def enumerated(like: np.ndarray, low: float, high: float) -> tuple[float, np.ndarray, np.ndarray, float]:

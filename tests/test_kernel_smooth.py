@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.kernels.smooth import smooth_curve
+from gyrostab.kernels.regression.smooth import smooth_curve
 
 
 @given(st.integers(8, 300), st.floats(-50.0, 50.0), st.floats(-1.0, 1.0))

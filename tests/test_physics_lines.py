@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 from gyrostab.errors import OptionError
-from gyrostab.kernels.coloured import oscillator_psd
+from gyrostab.kernels.random.coloured import oscillator_psd
 from gyrostab.physics.phase import fold
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import environment as env

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.coloured import oscillator_psd
+from gyrostab.kernels.random.coloured import oscillator_psd
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 
 from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
-from gyrostab.kernels.coloured import band, band_psd, folded_psd, oscillator, oscillator_psd
+from gyrostab.kernels.random.coloured import band, band_psd, folded_psd, oscillator, oscillator_psd
 from gyrostab.physics.base import Windows
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate

@@ -17,8 +17,8 @@ from gyrostab.ingest.columns import buffers
 from gyrostab.ingest.columns.pieces import Counts, Pieces, Spool, Steps, Words
 from gyrostab.ingest.combine import memory
 from gyrostab.ingest.formats import text
-from gyrostab.kernels.decimals import decimals_of, even_steps, from_decimals, to_decimals, unroll_steps
-from gyrostab.kernels.stamps import NO_STAMP, new_state, place
+from gyrostab.kernels.encoding.decimals import decimals_of, even_steps, from_decimals, to_decimals, unroll_steps
+from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
 from gyrostab.store.threads import in_order
 
 

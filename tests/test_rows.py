@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.ingest.columns.stamps import NAT
-from gyrostab.kernels.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, clean_column, read_rows
+from gyrostab.kernels.encoding.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, clean_column, read_rows
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from gyrostab.errors import OptionError
-from gyrostab.kernels.stochastic import RATIO, brownian_means, flicker_times
+from gyrostab.kernels.random.stochastic import RATIO, brownian_means, flicker_times
 from gyrostab.noise import LAWS, URAD_PER_S
 from gyrostab.simulate.noise import FLICKER_LOW, begin_noise, draw, make_noise, shape
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gyrostab.kernels import stamps as kernel
-from gyrostab.kernels.stamps import DUPLICATE, NO_STAMP, OUT_OF_ORDER, RESTART, STEP
+from gyrostab.kernels.grid import stamps as kernel
+from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, OUT_OF_ORDER, RESTART, STEP
 
 PERIOD = 10_000_000.0
 

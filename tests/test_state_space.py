@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.kernels.state_space import flicker_states, whiten
+from gyrostab.kernels.regression.state_space import flicker_states, whiten
 
 
 def walk_covariance(edges: np.ndarray) -> np.ndarray:

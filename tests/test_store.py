@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, SchemaError, TimeError
 from gyrostab.io.datasets import open_log, to_netcdf, to_zarr
-from gyrostab.kernels.counts import from_counts, to_counts
+from gyrostab.kernels.encoding.counts import from_counts, to_counts
 from gyrostab.store import chunk_samples
 from gyrostab.time.grid import TimeGridIndex, grid_times
 from tests import synthetic

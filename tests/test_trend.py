@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.kernels.trend import window_trend
+from gyrostab.kernels.regression.trend import window_trend
 
 
 def plain(values, seconds):

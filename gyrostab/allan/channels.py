@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.kernels.trend import window_trend
+from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels
 from gyrostab.store.direct import stretch

@@ -18,12 +18,12 @@ from gyrostab.allan.channels import window_channels
 from gyrostab.allan.plan import MOST_CELLS, Plan, last_sample, make_plan, units_of_work
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
-from gyrostab.kernels.covariance import diagonal_products
-from gyrostab.kernels.least_squares import identify_noise
-from gyrostab.kernels.outlier_count import count_outliers
-from gyrostab.kernels.pairs import white_pair_sum
-from gyrostab.kernels.reference import direct_sums, recursive_sums, reference_theta
-from gyrostab.kernels.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
+from gyrostab.kernels.allan.outlier_count import count_outliers
+from gyrostab.kernels.allan.pairs import white_pair_sum
+from gyrostab.kernels.allan.reference import direct_sums, recursive_sums, reference_theta
+from gyrostab.kernels.allan.surface import CELL_FIELDS, STRICT, Unit, surface_unit, window_means
+from gyrostab.kernels.fit.covariance import diagonal_products
+from gyrostab.kernels.fit.least_squares import identify_noise
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, avar_columns, sample_squares
 from gyrostab.schema import attributes

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy.special import gammaincc, gammaincinv
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.covariance import STOCHASTIC, product_tables
-from gyrostab.kernels.least_squares import FIT_FIELDS, fit_windows
-from gyrostab.kernels.limits import cell_limits, interpolate_quantile
-from gyrostab.kernels.pairs import white_pair_sum
+from gyrostab.kernels.allan.pairs import white_pair_sum
+from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
+from gyrostab.kernels.fit.least_squares import FIT_FIELDS, fit_windows
+from gyrostab.kernels.fit.limits import cell_limits, interpolate_quantile
 from gyrostab.noise import LAWS, TERMS, avar_columns, sample_squares
 from gyrostab.schema import attributes, check_surface
 from gyrostab.time.durations import duration_seconds, thin

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import OptionError
-from gyrostab.kernels.surface import Unit
+from gyrostab.kernels.allan.surface import Unit
 from gyrostab.schema import signal_name
 from gyrostab.time.durations import averaging_factors, samples, thin
 

@@ -13,7 +13,7 @@ from gyrostab.correlate.dataset import assemble
 from gyrostab.correlate.drivers import Driver, drivers, other_channels, slope_units
 from gyrostab.correlate.judge import VERDICTS, driver_limits, statement
 from gyrostab.errors import OptionError
-from gyrostab.kernels.coupling import (
+from gyrostab.kernels.regression.coupling import (
     Laws,
     averages,
     beside,

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError, TimeError
-from gyrostab.kernels.trend import window_trend
+from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.noise import HOUR
 from gyrostab.units import INNER
 

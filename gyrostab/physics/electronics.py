@@ -176,7 +176,7 @@ class GaussMarkov(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
-        from gyrostab.kernels.stochastic import ornstein_uhlenbeck_means
+        from gyrostab.kernels.random.stochastic import ornstein_uhlenbeck_means
 
         unit, after = np.empty(chunk.shape), []
         for row, (child, position) in enumerate(state):

@@ -59,7 +59,7 @@ class SpectralLine(Effect):
         if math.isinf(self.quality):
             self.each("phase", setup.axes)
             return None
-        from gyrostab.kernels.coloured import oscillator, rest
+        from gyrostab.kernels.random.coloured import oscillator, rest
 
         reading = oscillator(self.frequency, self.quality, setup.rate)
         return reading, rng, rest(reading, rng.standard_normal(2))
@@ -72,7 +72,7 @@ class SpectralLine(Effect):
             middle: Array = (np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5) * cycles
             phase = np.radians(self.each("phase", chunk.setup.axes))[:, None] - math.pi / 2.0
             return np.asarray(amplitude * turn_means(middle, np.full(1, cycles), phase)), None
-        from gyrostab.kernels.coloured import march
+        from gyrostab.kernels.random.coloured import march
 
         reading, rng, position = state
         values, position = march(reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position)
@@ -89,7 +89,7 @@ class SpectralLine(Effect):
         if math.isinf(self.quality):
             power = 0.5 * np.sinc(self.frequency / windows.rate) ** 2
             return Prediction(spectrum={"amplitude": line_density(windows, place, power)}, coherent=True, line=place)
-        from gyrostab.kernels.coloured import folded_psd, oscillator_psd
+        from gyrostab.kernels.random.coloured import folded_psd, oscillator_psd
 
         def density(f: Array) -> Array:
             return oscillator_psd(f, self.frequency, self.quality)

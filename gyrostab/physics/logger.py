@@ -126,7 +126,7 @@ class LoggerFilter(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """By what the spectrum of white noise is multiplied."""
-        from gyrostab.kernels.coloured import folded_psd
+        from gyrostab.kernels.random.coloured import folded_psd
 
         if not (self.cutoff or self.length):
             return Prediction()

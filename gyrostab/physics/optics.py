@@ -308,7 +308,7 @@ class SharedSource(Effect):
         if math.isinf(self.bandwidth):
             common = math.sqrt(chunk.rate) * rng.standard_normal(chunk.size)
         else:
-            from gyrostab.kernels.stochastic import ornstein_uhlenbeck_means
+            from gyrostab.kernels.random.stochastic import ornstein_uhlenbeck_means
 
             time = self._time()
             common, position = ornstein_uhlenbeck_means(rng.standard_normal((chunk.size, 2)), time * chunk.rate, position)

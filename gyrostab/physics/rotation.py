@@ -317,14 +317,14 @@ class RealMotion(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """The oscillator in its stationary state; no tilt yet."""
-        from gyrostab.kernels.coloured import oscillator, rest
+        from gyrostab.kernels.random.coloured import oscillator, rest
 
         reading = oscillator(self.frequency, self.quality, setup.rate)
         return reading, rng, rest(reading, rng.standard_normal(2)), None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """True rate [degree hour-1] on every sample."""
-        from gyrostab.kernels.coloured import march
+        from gyrostab.kernels.random.coloured import march
 
         reading, rng, position, tilt = state
         motion, position = march(reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position)
@@ -348,7 +348,7 @@ class RealMotion(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means: turning and tilt; and the spectrum of the sway, the same process on all axes."""
-        from gyrostab.kernels.coloured import folded_psd, oscillator_psd
+        from gyrostab.kernels.random.coloured import folded_psd, oscillator_psd
 
         direction = self.each("direction", windows.axes)[:, None]
         mean = {}

@@ -194,7 +194,7 @@ class AliasedVibration(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """The process at rest in its stationary state."""
-        from gyrostab.kernels.coloured import band, rest
+        from gyrostab.kernels.random.coloured import band, rest
 
         average = self.sampling == "average"
         reading = band(self.low, self.high, setup.rate, resonance=self.resonance, quality=self.quality, average=average)
@@ -202,7 +202,7 @@ class AliasedVibration(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
-        from gyrostab.kernels.coloured import march
+        from gyrostab.kernels.random.coloured import march
 
         reading, rng, position, sensitivity = state
         normal = rng.standard_normal((chunk.size, position.size + 1))
@@ -217,7 +217,7 @@ class AliasedVibration(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """The folded spectrum, the same process on all axes."""
-        from gyrostab.kernels.coloured import band_psd, folded_psd
+        from gyrostab.kernels.random.coloured import band_psd, folded_psd
 
         def density(f: Array) -> Array:
             return band_psd(f, self.low, self.high, resonance=self.resonance, quality=self.quality)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.kernels.stochastic import (
+from gyrostab.kernels.random.stochastic import (
     brownian_means,
     flicker_means,
     flicker_times,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
-from gyrostab.kernels.checksum import fletcher32
+from gyrostab.kernels.encoding.checksum import fletcher32
 from gyrostab.store.lock import library_lock
 
 __all__ = [

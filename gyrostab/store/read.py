@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
-from gyrostab.kernels.counts import from_counts
+from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.cf import declared_grids, decode_stamps, index_dim
 from gyrostab.store.direct import with_fill
 from gyrostab.store.header import SMALL, Header, read_header

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.stamps import look
+from gyrostab.kernels.grid.stamps import look
 
 __all__ = ["Seen", "look_at_cells", "with_seen"]
 

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.kernels.counts import to_counts
+from gyrostab.kernels.encoding.counts import to_counts
 from gyrostab.store.direct import can_fill, fill_row, with_fill
 from gyrostab.store.lock import library_lock
 

@@ -17,7 +17,7 @@ from gyrostab.diagnose.effects.candidates import windows_of
 from gyrostab.diagnose.effects.cells import cross_without, effective, in_place, pair_rows
 from gyrostab.diagnose.effects.response import inside_bands, response_of
 from gyrostab.diagnose.gains.lines import LEAK, expected_lines
-from gyrostab.kernels.periodogram import band_edges, ordinates, taper
+from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.logger import LoggerFilter
 from gyrostab.physics.prediction import Prediction

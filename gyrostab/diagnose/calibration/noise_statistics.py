@@ -9,8 +9,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.effects.cells import effective
-from gyrostab.kernels.expected import expected_powers
-from gyrostab.kernels.periodogram import band_edges, ordinates, taper
+from gyrostab.kernels.spectra.expected import expected_powers
+from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import HOUR, URAD_PER_S
 
 __all__ = ["NOISE", "band_columns", "common_variance", "line_columns", "noise_powers", "white_variance"]

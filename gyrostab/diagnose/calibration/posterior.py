@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.gains.products import mean_products, take_out
-from gyrostab.kernels.nonnegative import solve_nonnegative
+from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import HOUR
 
 __all__ = ["Fit", "Posterior", "expected_of", "fit_squares", "floor_square", "noise_posterior", "scales", "summed"]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.effects.candidates import Candidate
 from gyrostab.diagnose.gains.gain import Cells, independent, noise_columns
 from gyrostab.diagnose.reduction.reduced import measured, noise_at_orders
-from gyrostab.kernels.periodogram import taper
+from gyrostab.kernels.spectra.periodogram import taper
 
 __all__ = [
     "State",

@@ -1,6 +1,6 @@
 """What a design explains on time that was held out, for many records and many designs in the same few products.
 
-The data are block means, ``y ~ Normal(X beta, V)`` with V from `gyrostab.kernels.state_space`, and band powers,
+The data are block means, ``y ~ Normal(X beta, V)`` with V from `gyrostab.kernels.regression.state_space`, and band powers,
 ``P / S - 1 ~ Normal(X beta, 1 / shape)`` in every cell. Factors beta have a normal prior whose width is one of `WIDTHS` times the
 error that beta would have in white noise alone; widths, and random walk K and flicker B on a grid, are averaged over. So all there is
 to know of a design are products of whitened columns. They are linear in the number of blocks, and records with the same gaps share them.

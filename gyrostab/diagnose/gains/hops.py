@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.gains.levels import HOPS, Courses, course_evidence, level_courses, usual_courses, waves
 from gyrostab.diagnose.gains.products import WIDTHS, mean_products, take_out
-from gyrostab.kernels.periodogram import band_edges, band_powers, gap_spectra, ordinates, taper
+from gyrostab.kernels.spectra.periodogram import band_edges, band_powers, gap_spectra, ordinates, taper
 from gyrostab.physics.lorentz import lorentz_density
 
 __all__ = ["Hops", "hop_gain", "hop_powers"]

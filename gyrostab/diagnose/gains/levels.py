@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.gains.products import WIDTHS, Products, mean_products, pairs_of, take_out
 from gyrostab.diagnose.gains.wander import known_wander
-from gyrostab.kernels.evidence import mixed_evidence
-from gyrostab.kernels.levels import level_tables, levels_smooth
+from gyrostab.kernels.regression.evidence import mixed_evidence
+from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
 __all__ = ["HOPS", "Courses", "course_evidence", "level_courses", "level_gains", "usual_courses", "waves"]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.gains.folds import FOLDS
 from gyrostab.diagnose.gains.wander import Wander
-from gyrostab.kernels.evidence import chosen_products, mixed_evidence
-from gyrostab.kernels.state_space import flicker_states, whiten
+from gyrostab.kernels.regression.evidence import chosen_products, mixed_evidence
+from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
 
 __all__ = [

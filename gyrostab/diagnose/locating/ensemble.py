@@ -18,8 +18,8 @@ from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.locating.null_counts import COARSE, null_counts
 from gyrostab.diagnose.locating.shared_noise import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduction.reduced import noise_at_orders
-from gyrostab.kernels.periodogram import band_covariance, taper
-from gyrostab.kernels.stochastic import brownian_means, flicker_means, flicker_times, ornstein_uhlenbeck_means
+from gyrostab.kernels.random.stochastic import brownian_means, flicker_means, flicker_times, ornstein_uhlenbeck_means
+from gyrostab.kernels.spectra.periodogram import band_covariance, taper
 from gyrostab.noise import HOUR
 
 __all__ = ["null_records"]

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.reduction.outliers import Peaks, find_peaks, samples_at_once, zeros_together
 from gyrostab.diagnose.reduction.stretches import Stretch, channel_at, numeric_channels
 from gyrostab.errors import UnitError
-from gyrostab.kernels import periodogram as kernel
-from gyrostab.kernels.outliers import HISTOGRAM
+from gyrostab.kernels.spectra import periodogram as kernel
+from gyrostab.kernels.spectra.outliers import HISTOGRAM
 from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.outliers import HISTOGRAM, departures, histogram_edge, peaks
+from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
 __all__ = [
     "CHANCE",
@@ -38,7 +38,7 @@ _MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
 
 class Peaks(NamedTuple):
-    """Samples that stand alone, far from those about them: `gyrostab.kernels.outliers.peaks` of an axis."""
+    """Samples that stand alone, far from those about them: `gyrostab.kernels.spectra.outliers.peaks` of an axis."""
 
     block: NDArray[np.int64]
     size: Array

@@ -13,7 +13,7 @@ from gyrostab.diagnose.reduction.outliers import beyond_chance, count_outliers, 
 from gyrostab.diagnose.reduction.stretches import channel_means, numeric_channels, read_stretches, row_count, sample_count
 from gyrostab.diagnose.reduction.zero_cell import CELLS, cell_widths
 from gyrostab.errors import OptionError
-from gyrostab.kernels.smooth import smooth_curve
+from gyrostab.kernels.regression.smooth import smooth_curve
 from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import GAP_CAUSES, check_log, texts
 from gyrostab.time.durations import duration_seconds, samples
@@ -129,7 +129,7 @@ def reduce_log(
     Notes
     -----
     Block means are taken off and samples that are missing count as zero; powers are unbiased for white noise with any gaps (see
-    `gyrostab.kernels.periodogram`). Under random gaps a density S(f) is seen as ``neighbours * S + (1 - neighbours) * mean(S)``.
+    `gyrostab.kernels.spectra.periodogram`). Under random gaps a density S(f) is seen as ``neighbours * S + (1 - neighbours) * mean(S)``.
 
     Examples
     --------

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.gains.wander import known_wander
 from gyrostab.diagnose.views.cells import Array, Windows, cube_root_score, over_windows, values_of, view_dataset, window_set
 from gyrostab.diagnose.views.cross_axis import correlation_score
-from gyrostab.kernels.state_space import flicker_states, whiten
+from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
 
 __all__ = ["LENGTHS", "SPANS", "score"]

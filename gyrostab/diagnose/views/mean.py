@@ -9,8 +9,8 @@ import xarray as xr
 
 from gyrostab.diagnose.gains.wander import known_wander, mean_share
 from gyrostab.diagnose.views.cells import Array, Windows, over_windows, values_of, view_dataset, window_set
-from gyrostab.kernels.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
-from gyrostab.kernels.state_space import flicker_states
+from gyrostab.kernels.regression.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
+from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.noise import HOUR
 
 __all__ = ["LENGTHS", "MeanNoise", "box_mean", "mean_noise", "precision", "score", "window_means"]

@@ -167,7 +167,7 @@ class Words:
 
 @dataclass(frozen=True)
 class Counts:
-    """Decimals as whole numbers of 32 bits (`gyrostab.kernels.decimals`), to be converted to another unit as they are read."""
+    """Decimals as whole numbers of 32 bits (`gyrostab.kernels.encoding.decimals`), to be converted to another unit as they are read."""
 
     counts: _Kept  # int32
     tens: float
@@ -186,7 +186,7 @@ class Counts:
 
     def fill(self, first: int, out: NDArray[Any]) -> None:
         """Put the values from row `first` on into `out`."""
-        from gyrostab.kernels.decimals import from_decimals
+        from gyrostab.kernels.encoding.decimals import from_decimals
 
         from_decimals(_part(self.counts, first, out.size), self.tens, self.factor, self.offset, out)
 
@@ -213,7 +213,7 @@ class Steps:
 
     def fill(self, first: int, out: NDArray[Any]) -> None:
         """Put the values from row `first` on into `out`."""
-        from gyrostab.kernels.decimals import unroll_steps
+        from gyrostab.kernels.encoding.decimals import unroll_steps
 
         unroll_steps(self.table, first, out.view(np.int64))
 

@@ -115,7 +115,7 @@ class Intake:
         words : int
             Cells of channels that hold something that is no number (empty ones are not filled, which is no fault).
         """
-        from gyrostab.kernels.decimals import even_steps
+        from gyrostab.kernels.encoding.decimals import even_steps
 
         size = len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
         if size == 0:
@@ -175,8 +175,8 @@ class Intake:
 
     def _convert(self, column: Column, values: NDArray[np.float64]) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
         """Convert to the inner unit, in place or packed, infinities to NaN; and what `Taken.ranges` tells of the column."""
-        from gyrostab.kernels.decimals import decimals_of, to_decimals
-        from gyrostab.kernels.rows import clean_column
+        from gyrostab.kernels.encoding.decimals import decimals_of, to_decimals
+        from gyrostab.kernels.encoding.rows import clean_column
 
         tens = self.tens[column.source]
         for _ in range(2):

@@ -137,7 +137,7 @@ def _take_rows(intake: Intake, plan: Plan, options: ReadOptions, fetch: Fetch, s
 
 
 def _read_values(column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int) -> NDArray[np.float64]:
-    from gyrostab.kernels.rows import clean_column
+    from gyrostab.kernels.encoding.rows import clean_column
 
     values, _ = to_floats(fetch(column.source, start, stop))
     clean_column(values, column.factor, column.offset)

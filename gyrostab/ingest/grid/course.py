@@ -1,7 +1,7 @@
 """Rows with noisy stamps: the period that explains them best, and the place of every row in order.
 
 A stamp that is the time of arrival tells the time of its sample up to jitter, but thousands of stamps tell the sampling period to parts
-per million and the number of lost samples exactly. Rows stay in order; `gyrostab.kernels.course` finds where samples are missing.
+per million and the number of lost samples exactly. Rows stay in order; `gyrostab.kernels.grid.course` finds where samples are missing.
 Where rows arrive in packets, or a slow clock gives many rows one stamp, only one row of each group is looked at.
 """
 
@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.course import find_breaks, find_phase, follow, trace
-from gyrostab.kernels.stamps import DUPLICATE, NO_STAMP, RESTART, STEP, piece_sums
+from gyrostab.kernels.grid.course import find_breaks, find_phase, follow, trace
+from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP, piece_sums
 
 __all__ = ["LEAST_SIGMA", "Course", "count_along", "find_course", "follow_course", "observe_rows", "place_rows"]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.survey import BLOCK
-from gyrostab.kernels.stamps import NO_STAMP, RESTART, STEP
+from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
 from gyrostab.store.direct import can_fill, fill_row, held, stretch, with_fill
 from gyrostab.store.threads import in_order
 from gyrostab.time.grid import grid_times

@@ -12,7 +12,7 @@ from gyrostab.ingest.gap_table import CAUSE, FIRST, MOST_GAPS, thinned
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.survey import Survey
-from gyrostab.kernels.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
+from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES
 
 __all__ = ["find_gaps", "gap_table"]

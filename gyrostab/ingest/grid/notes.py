@@ -11,7 +11,7 @@ from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.survey import Survey, file_of
-from gyrostab.kernels.stamps import DUPLICATE, OUT_OF_ORDER, RESTART
+from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART
 from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.time.grid import grid_times
 

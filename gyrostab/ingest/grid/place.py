@@ -15,8 +15,8 @@ from gyrostab.ingest.grid.course import Course, place_rows
 from gyrostab.ingest.grid.rate import SECOND, RateEstimate, Stamps
 from gyrostab.ingest.grid.survey import file_of
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
-from gyrostab.kernels import stamps as kernel
-from gyrostab.kernels.stamps import DUPLICATE, LOOK, NO_STAMP, OUT_OF_ORDER, RESTART, STEP
+from gyrostab.kernels.grid import stamps as kernel
+from gyrostab.kernels.grid.stamps import DUPLICATE, LOOK, NO_STAMP, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.store.direct import stretch
 from gyrostab.time.grid import period_ns
 

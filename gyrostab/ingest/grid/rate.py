@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import TimeError
 from gyrostab.ingest.grid.course import Course, count_along, find_course, follow_course
 from gyrostab.ingest.grid.steps import cut, finer_period, refined
-from gyrostab.kernels.stamps import NO_STAMP, piece_sums, track
+from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
 from gyrostab.store.threads import in_order
 
 __all__ = ["RateEstimate", "Stamps", "estimate_near", "estimate_rate", "is_far_worse", "odd_stretches", "starting_period"]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.survey import BLOCK
-from gyrostab.kernels.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
+from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
 from gyrostab.store.direct import stretch
 
 __all__ = ["find_repeats", "with_repeats"]

@@ -52,7 +52,7 @@ class Typing:
 
 def parse_plain(block: bytes, start: int, rows: int, typing: Typing) -> tuple[Parsed, int]:
     """Parse the plain rows of a block (up to `rows`) from the byte `start` on, and tell where the first begins that is not plain."""
-    from gyrostab.kernels.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, read_rows
+    from gyrostab.kernels.encoding.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, read_rows
 
     layout = typing.layout
     roles = np.full(layout.width, SKIPPED, dtype=np.int64)

@@ -8,10 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.blocks import full_counts, grouped_blocks, groups, held_points, windows_from_blocks
-from gyrostab.kernels.clusters import cluster_cells, cluster_factor, cluster_strides, integrate_places, pack_mask
-from gyrostab.kernels.compiled import KERNEL
-from gyrostab.kernels.integrate import (
+from gyrostab.kernels.allan.blocks import full_counts, grouped_blocks, groups, held_points, windows_from_blocks
+from gyrostab.kernels.allan.clusters import cluster_cells, cluster_factor, cluster_strides, integrate_places, pack_mask
+from gyrostab.kernels.allan.integrate import (
     block_sums,
     first_present,
     integrate,
@@ -21,8 +20,9 @@ from gyrostab.kernels.integrate import (
     pyramid_places,
     thin_pyramid,
 )
-from gyrostab.kernels.intervals import single_blocks, valid_intervals
-from gyrostab.kernels.pairs import strict_gap_factors
+from gyrostab.kernels.allan.intervals import single_blocks, valid_intervals
+from gyrostab.kernels.allan.pairs import strict_gap_factors
+from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.workspace import Workspace
 
 __all__ = ["CELL_FIELDS", "NONE", "STRICT", "WEIGHTED", "Unit", "surface_unit", "window_means"]

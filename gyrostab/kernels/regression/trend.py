@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.nonnegative import REORDER
+from gyrostab.kernels.regression.nonnegative import REORDER
 
 __all__ = ["window_trend"]
 

@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.nonnegative import REORDER
+from gyrostab.kernels.regression.nonnegative import REORDER
 
 __all__ = ["STOCHASTIC", "diagonal_products", "product_tables"]
 

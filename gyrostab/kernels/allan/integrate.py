@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gyrostab.kernels.allan.vectors import LANES, TOGETHER
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.vectors import LANES, TOGETHER
 
 __all__ = [
     "TILE",
@@ -261,7 +261,7 @@ def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:
 def pyramid_places(n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
     """Where ``theta[:: 2**shift]`` of every shift (not falling) begins in one array, and the size of that array.
 
-    Behind the angles there is room for what `gyrostab.kernels.vectors.split_sums` reads and ignores: it goes as far with
+    Behind the angles there is room for what `gyrostab.kernels.allan.vectors.split_sums` reads and ignores: it goes as far with
     the longest of its lags as with the shortest.
     """
     apart = 0

@@ -6,7 +6,7 @@ that the mask alone determines, and so does a ramp, slightly, as lost samples mo
 returned, so that a fit can use them as its columns.
 
 What a pair of clusters adds does not depend on the window, so it is summed in blocks as the other terms are (see
-`gyrostab.kernels.blocks`). Samples and runs are counted in a mask of one bit a sample, which stays in the cache.
+`gyrostab.kernels.allan.blocks`). Samples and runs are counted in a mask of one bit a sample, which stays in the cache.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numba import njit
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from gyrostab.kernels.blocks import windows_from_blocks
+from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.compiled import INNER
 
 __all__ = ["cluster_cells", "cluster_factor", "cluster_strides", "integrate_places", "pack_mask"]

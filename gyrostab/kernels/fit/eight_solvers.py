@@ -1,7 +1,7 @@
 """Dense linear algebra of eight small problems side by side: elimination, and least squares that cannot be negative.
 
-Matrices and vectors are arrays of `gyrostab.kernels.eights`; element (i, j) of a matrix of w columns is row ``w i + j``.
-A set of terms is one row per term: above one half in the places whose problem has the term. What `gyrostab.kernels.nonnegative`
+Matrices and vectors are arrays of `gyrostab.kernels.fit.eights`; element (i, j) of a matrix of w columns is row ``w i + j``.
+A set of terms is one row per term: above one half in the places whose problem has the term. What `gyrostab.kernels.regression.nonnegative`
 does for one problem is done here for eight that differ in their sets.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.eights import PLACES, put, root, take, where_above
+from gyrostab.kernels.fit.eights import PLACES, put, root, take, where_above
 
 __all__ = ["back_substitute", "eliminate", "scale_equations", "solve_nonnegative_eights", "solve_terms"]
 

@@ -1,6 +1,6 @@
 """Eight windows as mixtures of noises: what each cell sees of every term, and the covariance of the cells.
 
-Everything here is an array of `gyrostab.kernels.eights`, a window in each place. A cell that is missing, or that pads the
+Everything here is an array of `gyrostab.kernels.fit.eights`, a window in each place. A cell that is missing, or that pads the
 averaging factors, is one without noise and without signal: zeros everywhere. So every window has the same shape.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.eights import number, put, root, take, where_above
+from gyrostab.kernels.fit.eights import number, put, root, take, where_above
 
 __all__ = [
     "DATA",

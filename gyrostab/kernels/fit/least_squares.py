@@ -2,8 +2,8 @@
 
 The Allan variance is linear in the squared coefficients, so a window is ``y = X s + e`` with ``s >= 0``. Overlapping
 estimates at neighbouring averaging factors share data; the covariance of e follows from the noise itself
-(`gyrostab.kernels.covariance`), so it is taken from the fit and iterated. Eight windows are fitted side by side
-(`gyrostab.kernels.eights`); each has the same numbers whatever its neighbours are.
+(`gyrostab.kernels.fit.covariance`), so it is taken from the fit and iterated. Eight windows are fitted side by side
+(`gyrostab.kernels.fit.eights`); each has the same numbers whatever its neighbours are.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.eight_solvers import back_substitute, eliminate, scale_equations, solve_nonnegative_eights, solve_terms
-from gyrostab.kernels.eights import PLACES, eights, put, root, take, where_above
-from gyrostab.kernels.mixture import (
+from gyrostab.kernels.fit.eight_solvers import back_substitute, eliminate, scale_equations, solve_nonnegative_eights, solve_terms
+from gyrostab.kernels.fit.eights import PLACES, eights, put, root, take, where_above
+from gyrostab.kernels.fit.mixture import (
     DATA,
     PRODUCTS,
     WIDTH,

@@ -1,6 +1,6 @@
 """Block sums interval by interval, one averaging factor at a time: where the angle needs two doubles or has gaps itself.
 
-`gyrostab.kernels.blocks` is several times faster and does the rest; both fill the same heads and tails.
+`gyrostab.kernels.allan.blocks` is several times faster and does the rest; both fill the same heads and tails.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: i
 
 @njit(**KERNEL)
 def single_blocks(high, low, places, starts, stops, angle, step, ks, shifts, head_lengths, whole, n_windows):  # type: ignore[no-untyped-def]
-    """Heads and tails as `gyrostab.kernels.blocks.grouped_blocks`; `low` is the remainder of `high`, or empty."""
+    """Heads and tails as `gyrostab.kernels.allan.blocks.grouped_blocks`; `low` is the remainder of `high`, or empty."""
     n_blocks = n_windows + whole[0]
     heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     head_counts, tail_counts = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))

@@ -265,7 +265,7 @@ def find_phase(count, stamps, period, sigma):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def follow(count, stamps, period, sigma, gain, longest, block):  # type: ignore[no-untyped-def]
-    """Count the samples along noisy stamps, as `gyrostab.kernels.stamps.track` does along sharp ones.
+    """Count the samples along noisy stamps, as `gyrostab.kernels.grid.stamps.track` does along sharp ones.
 
     Parameters
     ----------

@@ -18,9 +18,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gyrostab.kernels.allan.integrate import TILE, integrate_tile, thin_pyramid
+from gyrostab.kernels.allan.vectors import IN_A_ROW, TOGETHER, split_sums
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.integrate import TILE, integrate_tile, thin_pyramid
-from gyrostab.kernels.vectors import IN_A_ROW, TOGETHER, split_sums
 
 __all__ = ["full_counts", "grouped_blocks", "groups", "held_points", "windows_from_blocks"]
 

@@ -1,0 +1,1 @@
+"""Text rows to numbers, and numbers to fewer bytes and back."""

@@ -1,0 +1,1 @@
+"""Random series: ideal gyro noise and coloured processes, as means over each sample."""

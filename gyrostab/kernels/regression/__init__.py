@@ -1,0 +1,1 @@
+"""Linear models of correlated series: likelihood, evidence, filters, smooth curves."""

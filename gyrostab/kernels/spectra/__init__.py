@@ -1,0 +1,1 @@
+"""Periodograms of blocks with gaps, their expectation, and outliers."""
