@@ -20,10 +20,10 @@ import xarray as xr
 from page import machine
 from scipy.stats import binom, kstest
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.gains.gain import mean_gains, power_gains
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.held_out import mean_gains, power_gains
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}

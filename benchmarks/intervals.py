@@ -17,14 +17,14 @@ from page import renew
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import Part, explain_away
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.modelling.refit import fit_claims
-from gyrostab.diagnose.naming.claims import Claim, Naming
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.linear_model import begin_state
 from tests.named import COEFFICIENT, record
 
 

@@ -13,14 +13,14 @@ import xarray as xr
 
 from gyrostab.blindtest.scenarios.case import make_case
 from gyrostab.blindtest.scenarios.plan import plan_case
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.search import gains, totals
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.gains.gain import mean_factors
-from gyrostab.diagnose.gains.products import mean_products
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.held_out import mean_factors
+from gyrostab.diagnose.evidence.products import mean_products
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains, totals
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 
 EFFECTS = ("temperature_bias", "shupe", "warm_up", "vibration_rectification", "bias_jump")
 COLUMNS = ("all known", "size unknown", "K and B unknown too", "scored")

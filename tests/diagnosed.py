@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.conclusion.result import Diagnosis
-from gyrostab.diagnose.conclusion.sentences import effect_statement, mismatch_statement
+from gyrostab.diagnose.result.diagnosis import Diagnosis
+from gyrostab.diagnose.result.text import effect_statement, mismatch_statement
 from gyrostab.noise import model_avar
 from gyrostab.physics.registry import make_effect
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.locating.null_scores import NullScores, standardise
-from gyrostab.diagnose.views import VIEWS
+from gyrostab.diagnose.nulls.scores import NullScores, standardise
+from gyrostab.diagnose.statistics import VIEWS
 from gyrostab.noise import TERMS
 
 RATE, BLOCK_S, PARTS = 100.0, 20.0, 8

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.conclusion.account import acting, spans
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.naming.claims import Claim
+from gyrostab.diagnose.identify.identification import Claim
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.result.attribution import acting, spans
 from tests.named import COEFFICIENT, WORLD, record
 
 

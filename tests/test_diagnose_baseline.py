@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
-from gyrostab.diagnose.calibration.noise_statistics import common_variance, noise_powers, white_variance
-from gyrostab.diagnose.calibration.posterior import Fit, fit_squares
-from gyrostab.diagnose.calibration.quiet import quiet_blocks
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.diagnose.views.cells import cube_root_score
-from gyrostab.diagnose.views.davar import allan_surface
+from gyrostab.diagnose.baseline.calibrate import calibrate, from_model, from_simulation
+from gyrostab.diagnose.baseline.expected_statistics import common_variance, noise_powers, white_variance
+from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
+from gyrostab.diagnose.baseline.quiescent import quiet_blocks
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.power import allan_surface
+from gyrostab.diagnose.statistics.scores import cube_root_score
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.spectra.expected import expected_powers
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper

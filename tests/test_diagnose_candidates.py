@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import VIEWS, effect_candidates, term_density, windows_of
-from gyrostab.diagnose.effects.cells import begin_state, cells_of, drawn, effective, power_column
-from gyrostab.diagnose.effects.generics import generic_candidates, splines
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.gains.gain import cell_factors, power_factors
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.held_out import cell_factors, power_factors
+from gyrostab.diagnose.predict.candidates import VIEWS, effect_candidates, term_density, windows_of
+from gyrostab.diagnose.predict.linear_model import begin_state, cells_of, drawn, effective, power_column
+from gyrostab.diagnose.predict.nuisance import generic_candidates, splines
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import simulate

@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.channel_use import unused_channels
-from gyrostab.diagnose.reduction.aligned import align_channels
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.channel_use import unused_channels
+from gyrostab.diagnose.reduce.aligned_channels import align_channels
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.time.grid import time_coordinate
 

@@ -11,12 +11,12 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.conclusion.account import _can_show, spans
-from gyrostab.diagnose.conclusion.content import chance_of_gain
-from gyrostab.diagnose.conclusion.result import check_diagnosis
 from gyrostab.diagnose.core import diagnose, quiet_span
-from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.explained import Part
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.result.attribution import _can_show, spans
+from gyrostab.diagnose.result.diagnosis import check_diagnosis
+from gyrostab.diagnose.result.tables import chance_of_gain
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import to_netcdf

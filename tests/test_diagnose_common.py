@@ -11,14 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.conclusion.account import explanations
-from gyrostab.diagnose.conclusion.sentences import mismatch_statement
-from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.locating.boxes import merged
-from gyrostab.diagnose.locating.locate import locate
-from gyrostab.diagnose.locating.null_scores import null_scores, standardise
-from gyrostab.diagnose.views import common, mean
+from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.nulls.scores import null_scores, standardise
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.result.attribution import explanations
+from gyrostab.diagnose.result.text import mismatch_statement
+from gyrostab.diagnose.statistics import common_mode as common
+from gyrostab.diagnose.statistics import mean
 from tests.reduced_records import BLOCK_S, baseline, chunks, records
 
 BLOCKS = 180

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.cells import State, begin_state
-from gyrostab.diagnose.effects.explained import reweighted
-from gyrostab.diagnose.effects.generics import generic_candidates
-from gyrostab.diagnose.effects.search import Found, Tallies, gains
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.naming.complete import unrest
-from gyrostab.diagnose.naming.name import _Search, name_effects
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.completeness import unrest
+from gyrostab.diagnose.identify.forward_search import _Search, name_effects
+from gyrostab.diagnose.predict.condition import reweighted
+from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.nuisance import generic_candidates
+from gyrostab.diagnose.predict.search import Found, Tallies, gains
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from tests.named import nulls
 

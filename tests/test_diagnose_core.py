@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.conclusion.result import Diagnosis
 from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.simulate import simulate
 
 N = 0.003  # deg/sqrt(h)

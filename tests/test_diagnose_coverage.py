@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import explain_away
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.modelling.limits import limits
-from gyrostab.diagnose.modelling.refit import fit_claims
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.estimate.upper_limits import limits
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.predict.condition import explain_away
+from gyrostab.diagnose.predict.linear_model import begin_state
 from tests.named import WORLD, record
 from tests.test_diagnose_refit import claimed
 

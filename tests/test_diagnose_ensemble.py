@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate, from_model
-from gyrostab.diagnose.gains.gain import mean_gains, power_gains
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.reduction.outliers import CHANCE
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate, from_model
+from gyrostab.diagnose.evidence.held_out import mean_gains, power_gains
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.reduce.outliers import CHANCE
 from gyrostab.kernels.spectra.periodogram import band_covariance
 from gyrostab.simulate import simulate
 

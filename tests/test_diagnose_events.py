@@ -7,20 +7,20 @@ import pytest
 import xarray as xr
 from scipy.signal import lfilter
 
-from gyrostab.diagnose.calibration.baseline import from_model
-from gyrostab.diagnose.effects.candidates import Candidate, effect_candidates
-from gyrostab.diagnose.effects.cells import State, begin_state
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.effects.generics import stretches
-from gyrostab.diagnose.effects.search import gains
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.naming.name import name_effects
-from gyrostab.diagnose.naming.parts import by_key, gain_sum
-from gyrostab.diagnose.naming.structure import possible
-from gyrostab.diagnose.naming.surrogates import beats_slides
-from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.diagnose.views import locked
+from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import by_key, gain_sum
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identifiability import possible
+from gyrostab.diagnose.identify.surrogates import beats_slides
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.predict.candidates import Candidate, effect_candidates
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.nuisance import stretches
+from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import phase_locked as locked
 from gyrostab.ingest.make_log import make_log
 from tests.named import nulls
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.conclusion.evidence import held_out, log_likelihood, stretches
-from gyrostab.diagnose.conclusion.surfaces import CASES, make_surfaces
+from gyrostab.diagnose.result.held_out import held_out, log_likelihood, stretches
+from gyrostab.diagnose.result.surfaces import CASES, make_surfaces
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
 from tests.reduced_records import BLOCK_S, RATE, baseline, records

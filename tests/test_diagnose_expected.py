@@ -7,11 +7,11 @@ import pytest
 from scipy import signal
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import from_model
-from gyrostab.diagnose.calibration.known import known_motion
-from gyrostab.diagnose.gains.wander import known_wander, mean_share
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.baseline.known_effects import known_motion
+from gyrostab.diagnose.evidence.wandering import known_wander, mean_share
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}

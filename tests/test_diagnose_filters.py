@@ -7,17 +7,17 @@ import pytest
 import xarray as xr
 from scipy.signal import butter, lfilter, sosfilt
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.effects.response import is_filter
-from gyrostab.diagnose.effects.search import gains
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.naming.filters import filter_sizes, on_all_axes
-from gyrostab.diagnose.naming.parts import by_key, gain_sum
-from gyrostab.diagnose.naming.structure import possible
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import by_key, gain_sum
+from gyrostab.diagnose.identify.identifiability import possible
+from gyrostab.diagnose.identify.logger_filters import filter_sizes, on_all_axes
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.filter_response import is_filter
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.search import gains, totals
-from gyrostab.diagnose.gains.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.gains.gain import mean_factors, mean_gains, noise_columns, power_factors, power_gains, score
-from gyrostab.diagnose.gains.products import WIDTHS
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
+from gyrostab.diagnose.evidence.held_out import mean_factors, mean_gains, noise_columns, power_factors, power_gains, score
+from gyrostab.diagnose.evidence.products import WIDTHS
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains, totals
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.regression.state_space import flicker_states

@@ -16,17 +16,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.conclusion import conclude
-from gyrostab.diagnose.conclusion.content import effect_tables, unknown_tables
-from gyrostab.diagnose.conclusion.gate import supported_axes, with_supported_claims
-from gyrostab.diagnose.conclusion.sentences import summary
-from gyrostab.diagnose.conclusion.verdict import decide_verdict, failed_checks
-from gyrostab.diagnose.effects.designs import Candidate
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.modelling.limits import mixture_limit
-from gyrostab.diagnose.modelling.refit import Estimate, Fitted, fit_claims
-from gyrostab.diagnose.naming.claims import Claim, Naming
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_claims
+from gyrostab.diagnose.estimate.upper_limits import mixture_limit
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.designs import Candidate
+from gyrostab.diagnose.result import finish as conclude
+from gyrostab.diagnose.result.size_gate import supported_axes, with_supported_claims
+from gyrostab.diagnose.result.tables import effect_tables, unknown_tables
+from gyrostab.diagnose.result.text import summary
+from gyrostab.diagnose.result.verdict import decide_verdict, failed_checks
 from gyrostab.physics.registry import effects
 
 from .diagnosed import content

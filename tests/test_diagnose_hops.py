@@ -6,8 +6,8 @@ import xarray as xr
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.gains.hops import Hops, hop_gain, hop_powers
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.evidence.fast_switching import Hops, hop_gain, hop_powers
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 
 BLOCKS, PIECES, STEP, WHITE = 60, 16, 20.0, 0.01

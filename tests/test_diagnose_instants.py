@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.instants import tried_instants
-from gyrostab.diagnose.effects.search import gains
-from gyrostab.diagnose.gains.folds import fold_blocks
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.step_times import tried_instants
 from gyrostab.physics.prediction import Windows
 from tests.named import COEFFICIENT, record
 

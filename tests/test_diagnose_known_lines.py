@@ -9,12 +9,12 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import from_model
-from gyrostab.diagnose.calibration.known import without_known_lines
-from gyrostab.diagnose.gains.lines import expected_lines, line_gains
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.diagnose.views.spectrum import score
+from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.baseline.known_effects import without_known_lines
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_gains
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.spectral_line import score
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "K": 0.02}

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate, from_model
-from gyrostab.diagnose.calibration.lattice import angle_share, rounded_rates
-from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.modelling.refit import fit_claims
-from gyrostab.diagnose.naming.name import name_effects
-from gyrostab.diagnose.naming.structure import structural
-from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.diagnose.reduction.zero_cell import cut_off, may_be_cut_off
+from gyrostab.diagnose.baseline.calibrate import calibrate, from_model
+from gyrostab.diagnose.baseline.quantization_grid import angle_share, rounded_rates
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identifiability import structural
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.reduce.zero_bin import cut_off, may_be_cut_off
 from gyrostab.ingest.make_log import make_log
 from tests.named import nulls
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.naming.claims import Claim, with_axes_of
-from gyrostab.diagnose.naming.layers import layers
-from gyrostab.diagnose.naming.name import name_effects
-from gyrostab.diagnose.naming.parts import gain_of
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.identify.components import gain_of
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identification import Claim, with_axes_of
+from gyrostab.diagnose.identify.overlapping import layers
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))

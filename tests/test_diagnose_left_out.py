@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.cells import begin_state, cross_without
-from gyrostab.diagnose.effects.explained import Part, take_part, without_odd
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part, take_part, without_odd
+from gyrostab.diagnose.predict.linear_model import begin_state, cross_without
 from tests.reduced_records import baseline, records
 
 BLOCKS = 40

@@ -8,17 +8,17 @@ import xarray as xr
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.cells import State
-from gyrostab.diagnose.effects.explained import Part, take_parts
-from gyrostab.diagnose.effects.search import Found
-from gyrostab.diagnose.gains.levels import HOPS, level_courses, level_gains
-from gyrostab.diagnose.modelling.level_sizes import level_sizes
-from gyrostab.diagnose.naming.claims import Claim, Naming
-from gyrostab.diagnose.naming.hopping import followed_first, hops_alone
-from gyrostab.diagnose.naming.name import name_effects
-from gyrostab.diagnose.naming.structure import possible
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.estimate.telegraph_sizes import level_sizes
+from gyrostab.diagnose.evidence.telegraph import HOPS, level_courses, level_gains
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identifiability import possible
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.identify.switching import followed_first, hops_alone
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part, take_parts
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import Found
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
 from tests.named import nulls

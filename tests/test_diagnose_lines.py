@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.designs import Candidate, Variant
-from gyrostab.diagnose.effects.explained import Part, explain_away
-from gyrostab.diagnose.effects.response import straightened
-from gyrostab.diagnose.effects.search import gains, of_means
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.gains.lines import line_gains, line_skirt
-from gyrostab.diagnose.naming.claims import Claim, form_error, with_claim
-from gyrostab.diagnose.naming.name import name_effects
-from gyrostab.diagnose.naming.odd import line_size
-from gyrostab.diagnose.naming.parts import by_key, without_lines
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.spectral_lines import line_gains, line_skirt
+from gyrostab.diagnose.identify.components import by_key, without_lines
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identification import Claim, form_error, with_claim
+from gyrostab.diagnose.identify.sample_sizes import line_size
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.designs import Candidate, Variant
+from gyrostab.diagnose.predict.filter_response import straightened
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains, of_means
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from tests.named import nulls
 

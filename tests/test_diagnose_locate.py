@@ -7,10 +7,10 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from gyrostab.diagnose.locating.boxes import merged
-from gyrostab.diagnose.locating.locate import locate
-from gyrostab.diagnose.locating.null_scores import null_scores
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.nulls.scores import null_scores
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError
 from gyrostab.ingest.make_log import make_log
 from tests.reduced_records import BLOCK_S, RATE, baseline, chunks, records, smallest_p

@@ -8,8 +8,8 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.reduction.outliers import lattice_step
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.reduce.outliers import lattice_step
 from gyrostab.ingest.make_log import make_log
 
 RATE = 100.0

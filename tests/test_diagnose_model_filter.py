@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import from_model
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}

@@ -12,8 +12,8 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.conclusion.result import effect_table, model_text
-from gyrostab.diagnose.modelling.refit import _instance
+from gyrostab.diagnose.estimate.joint_fit import _instance
+from gyrostab.diagnose.result.diagnosis import effect_table, model_text
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import read_model, simulate
 

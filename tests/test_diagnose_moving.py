@@ -9,11 +9,11 @@ import pytest
 import xarray as xr
 
 from gyrostab import diagnose
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.conclusion.content import motion_tables
-from gyrostab.diagnose.effects.candidates import windows_of
-from gyrostab.diagnose.naming.moving import moving_blocks, unexplained_motion, without_motion
-from gyrostab.diagnose.reduction.reduced import measured, reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.identify.moving_axes import moving_blocks, unexplained_motion, without_motion
+from gyrostab.diagnose.predict.candidates import windows_of
+from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
+from gyrostab.diagnose.result.tables import motion_tables
 from gyrostab.errors import SchemaError
 from gyrostab.simulate import simulate
 

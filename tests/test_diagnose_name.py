@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.effects.explained import Part, explain_away
-from gyrostab.diagnose.effects.search import together
-from gyrostab.diagnose.gains.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.gains.lines import line_gains
-from gyrostab.diagnose.gains.tallies import count_gains, expected_counts
-from gyrostab.diagnose.naming.name import Claim, name_effects, tail_level
-from gyrostab.diagnose.naming.structure import possible
-from gyrostab.diagnose.naming.surrogates import beats_slides
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
+from gyrostab.diagnose.evidence.sample_counts import count_gains, expected_counts
+from gyrostab.diagnose.evidence.spectral_lines import line_gains
+from gyrostab.diagnose.identify.forward_search import Claim, name_effects, tail_level
+from gyrostab.diagnose.identify.identifiability import possible
+from gyrostab.diagnose.identify.surrogates import beats_slides
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.search import together
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError
 from gyrostab.ingest.make_log import make_log
 from tests.named import WORLD, nulls, record
@@ -64,7 +64,7 @@ def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
     (part,) = (one for one in claim.parts if one.candidate.view == "power")
     elsewhere = [replace(part, row=(axis,)) for axis in "yz"]
     sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
-    monkeypatch.setattr(sys.modules["gyrostab.diagnose.effects.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
+    monkeypatch.setattr(sys.modules["gyrostab.diagnose.predict.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
     assert possible([part, *elsewhere], state) == [part, elsewhere[1]]
 
 

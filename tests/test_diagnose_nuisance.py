@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import explain_away
-from gyrostab.diagnose.modelling.refit import fit_claims
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.predict.condition import explain_away
+from gyrostab.diagnose.predict.linear_model import begin_state
 from gyrostab.physics.registry import make_effect
 from tests.named import record
 from tests.test_diagnose_refit import claimed

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.conclusion import conclude
-from gyrostab.diagnose.modelling.odd_power import with_odd_power
-from gyrostab.diagnose.modelling.predict import predicted
-from gyrostab.diagnose.modelling.recalibrate import recalibrate
-from gyrostab.diagnose.modelling.refit import fit_claims
-from gyrostab.diagnose.naming.name import Naming, name_effects
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.estimate.outlier_power import with_odd_power
+from gyrostab.diagnose.estimate.recalibrate import recalibrate
+from gyrostab.diagnose.identify.forward_search import Naming, name_effects
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result import finish as conclude
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.effect_bench import run

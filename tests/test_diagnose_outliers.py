@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.reduction.outliers import CHANCE, count_outliers, find_peaks
+from gyrostab.diagnose.reduce.outliers import CHANCE, count_outliers, find_peaks
 from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures
 
 SIZE, BLOCK, RATE = 18_000, 180, 10.0  # half an hour

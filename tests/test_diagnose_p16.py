@@ -11,12 +11,14 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.conclusion.content import claim_tables
-from gyrostab.diagnose.effects.designs import Candidate, Variant
-from gyrostab.diagnose.effects.explained import Part, without_turns
-from gyrostab.diagnose.naming.claims import Claim, Naming
-from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.diagnose.views import cross_axis, distribution, spectrum
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.predict.condition import Part, without_turns
+from gyrostab.diagnose.predict.designs import Candidate, Variant
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result.tables import claim_tables
+from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
+from gyrostab.diagnose.statistics import sample_counts as distribution
+from gyrostab.diagnose.statistics import spectral_line as spectrum
 from gyrostab.ingest.make_log import make_log
 
 from .conftest import ROOT

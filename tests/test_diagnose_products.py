@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gyrostab.diagnose.gains.products import evidence, mean_products, pairs_of, take_out
+from gyrostab.diagnose.evidence.products import evidence, mean_products, pairs_of, take_out
 
 
 def test_products_of_columns_that_never_meet_are_not_needed():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate, from_model, from_simulation
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 
 from .test_diagnose_baseline import NOISE, SHAKEN, log
 

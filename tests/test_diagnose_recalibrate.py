@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.conclusion import conclude
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import Part, explain_away
-from gyrostab.diagnose.effects.search import Tallies
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.modelling.predict import predicted
-from gyrostab.diagnose.modelling.recalibrate import recalibrate, with_noise
-from gyrostab.diagnose.modelling.refit import fit_claims
-from gyrostab.diagnose.naming.claims import Claim, Naming
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import Tallies
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result import finish as conclude
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}

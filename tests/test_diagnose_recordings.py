@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.gains.tallies import coarse_lattice
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.sample_counts import coarse_lattice
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from tests.scripts import load_script
 
 pytestmark = pytest.mark.xdist_group("diagnose_recordings")

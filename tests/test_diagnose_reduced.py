@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.reduction.reduced import block_samples, reduce_log
+from gyrostab.diagnose.reduce.block_statistics import block_samples, reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import band_covariance, band_edges, ordinates, taper

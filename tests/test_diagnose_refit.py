@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import Part, explain_away
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.modelling.limits import limits
-from gyrostab.diagnose.modelling.predict import predicted
-from gyrostab.diagnose.modelling.refit import FORM_ERROR, fit_claims
-from gyrostab.diagnose.naming.name import Claim, Naming, name_effects
-from gyrostab.diagnose.naming.odd import line_size
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, fit_claims
+from gyrostab.diagnose.estimate.upper_limits import limits
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.forward_search import Claim, Naming, name_effects
+from gyrostab.diagnose.identify.sample_sizes import line_size
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.linear_model import begin_state
 from gyrostab.simulate import simulate
 from tests.named import COEFFICIENT, nulls, record
 

@@ -8,14 +8,16 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.conclusion.sentences import mismatch_statement
-from gyrostab.diagnose.locating.boxes import merged
-from gyrostab.diagnose.locating.ensemble import _leaked
-from gyrostab.diagnose.locating.locate import locate
-from gyrostab.diagnose.locating.null_scores import null_scores, standardise
-from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.diagnose.views import gliding, restless, spectrum
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.nulls.records import _leaked
+from gyrostab.diagnose.nulls.scores import null_scores, standardise
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result.text import mismatch_statement
+from gyrostab.diagnose.statistics import drifting_line as gliding
+from gyrostab.diagnose.statistics import spectral_line as spectrum
+from gyrostab.diagnose.statistics import variance_stability as restless
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import taper
 from tests.reduced_records import baseline, chunks, records

@@ -16,8 +16,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.conclusion.result import VERDICTS, Diagnosis, check_diagnosis, effect_table, model_text, plain
-from gyrostab.diagnose.conclusion.sentences import (
+from gyrostab.diagnose.result.diagnosis import VERDICTS, Diagnosis, check_diagnosis, effect_table, model_text, plain
+from gyrostab.diagnose.result.text import (
     chance,
     clock,
     mismatch_statement,

@@ -9,9 +9,9 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import from_model
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "K": 0.02}

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state, cross_column, pair_rows
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.modelling.shared_sizes import shared_sizes
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.shared_factors import shared_sizes
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.linear_model import begin_state, cross_column, pair_rows
 from tests.named import COEFFICIENT, record
 
 AXES = ("x", "y", "z")

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.search import gains
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.naming.name import name_effects
-from gyrostab.diagnose.naming.parts import by_key
-from gyrostab.diagnose.naming.structure import plainer_effect, possible
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import by_key
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identifiability import plainer_effect, possible
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 from tests.named import nulls
 

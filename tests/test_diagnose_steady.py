@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from gyrostab.diagnose.calibration.baseline import from_model
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import State, begin_state
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.effects.search import gains
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.naming.parts import by_key
-from gyrostab.diagnose.naming.steady import always_there
-from gyrostab.diagnose.naming.structure import possible
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import by_key
+from gyrostab.diagnose.identify.identifiability import possible
+from gyrostab.diagnose.identify.steady import always_there
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 
 MODEL = {"noise": {"N": 0.003}, "log": {"axes": ["x"]}}

@@ -9,9 +9,9 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.calibration.known import known_motion, without_known_motion
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.known_effects import known_motion, without_known_motion
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.task import Task, still_lines
 from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.naming.surrogates import beats_slides
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.surrogates import beats_slides
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 

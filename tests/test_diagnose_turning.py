@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import explain_away
-from gyrostab.diagnose.effects.search import gains
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.modelling.refit import fit_claims
-from gyrostab.diagnose.naming.claims import Claim, Naming
-from gyrostab.diagnose.naming.parts import by_key, gain_sum
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import by_key, gain_sum
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import explain_away
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 

@@ -9,11 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.calibration.baseline import calibrate
-from gyrostab.diagnose.locating.null_scores import null_scores, standardise
-from gyrostab.diagnose.reduction.reduced import reduce_log
-from gyrostab.diagnose.views import VIEWS, cross_axis, davar, distribution, locked, mean, restart, spectrum
-from gyrostab.diagnose.views.cells import cube_root_score, exponential_score, over_windows, window_set
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.nulls.scores import null_scores, standardise
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import VIEWS, mean, restart
+from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
+from gyrostab.diagnose.statistics import phase_locked as locked
+from gyrostab.diagnose.statistics import power as davar
+from gyrostab.diagnose.statistics import sample_counts as distribution
+from gyrostab.diagnose.statistics import spectral_line as spectrum
+from gyrostab.diagnose.statistics.scores import cube_root_score, exponential_score, over_windows, window_set
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.regression.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
 from gyrostab.noise import LAWS
@@ -199,7 +204,7 @@ def test_mean_estimates_the_step(base):
 
 
 def test_a_line_has_its_amplitude():
-    from gyrostab.diagnose.reduction.reduced import reduce_log
+    from gyrostab.diagnose.reduce.block_statistics import reduce_log
     from gyrostab.ingest.make_log import make_log
 
     rng, n = np.random.default_rng(6), 180_000

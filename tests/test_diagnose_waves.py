@@ -9,10 +9,10 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.effects.candidates import Candidate, Variant
-from gyrostab.diagnose.effects.explained import Part
-from gyrostab.diagnose.naming.claims import Claim, Naming
-from gyrostab.diagnose.naming.waves import without_waves
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.identify.phase_locked import without_waves
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part
 from gyrostab.simulate import simulate
 
 N = 0.003  # deg/sqrt(h)

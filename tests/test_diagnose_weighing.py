@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.conclusion.account import explanations
-from gyrostab.diagnose.conclusion.weighing import needed
-from gyrostab.diagnose.effects.candidates import effect_candidates
-from gyrostab.diagnose.effects.cells import begin_state
-from gyrostab.diagnose.effects.explained import Part, explain_away, odd_blocks
-from gyrostab.diagnose.gains.folds import fold_blocks
-from gyrostab.diagnose.locating.boxes import merged
-from gyrostab.diagnose.locating.locate import locate
-from gyrostab.diagnose.locating.null_scores import null_scores
-from gyrostab.diagnose.modelling.predict import predicted
-from gyrostab.diagnose.naming.claims import Claim, Naming
-from gyrostab.diagnose.views import mean
+from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.nulls.scores import null_scores
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part, explain_away, odd_blocks
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.result.attribution import explanations
+from gyrostab.diagnose.result.attribution_weights import needed
+from gyrostab.diagnose.statistics import mean
 from tests.named import COEFFICIENT, nulls, record
 
 NAMES = (("vibration_noise", "power", "white"), ("vibration_rectification", "mean", "sensitivity"), ("spikes", "marks", "outliers"))

@@ -17,7 +17,7 @@ import gyrostab
 from gyrostab.blindtest.runner.folder import TUNING
 from gyrostab.blindtest.scenarios.plan import plan_case
 from gyrostab.blindtest.scoring.table import score_table
-from gyrostab.diagnose.conclusion.result import check_diagnosis
+from gyrostab.diagnose.result.diagnosis import check_diagnosis
 
 NUMBER = 5
 

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.calibration.baseline import calibrate, from_model, from_simulation
-from gyrostab.diagnose.calibration.known import known_motion, without_known_lines
-from gyrostab.diagnose.conclusion.account import unexpected
-from gyrostab.diagnose.conclusion.conclude import conclude
-from gyrostab.diagnose.conclusion.result import Diagnosis
-from gyrostab.diagnose.locating.ensemble import null_records
-from gyrostab.diagnose.locating.locate import locate
-from gyrostab.diagnose.locating.null_scores import null_scores
-from gyrostab.diagnose.modelling.expected_effects import expected_baseline, without_expected
-from gyrostab.diagnose.modelling.recalibrate import without_hops
-from gyrostab.diagnose.naming.moving import unexplained_motion, without_motion
-from gyrostab.diagnose.naming.name import name_effects
-from gyrostab.diagnose.reduction.aligned import align_channels
-from gyrostab.diagnose.reduction.reduced import reduce_log
+from gyrostab.diagnose.baseline.calibrate import calibrate, from_model, from_simulation
+from gyrostab.diagnose.baseline.known_effects import known_motion, without_known_lines
+from gyrostab.diagnose.estimate.expected_effects import expected_baseline, without_expected
+from gyrostab.diagnose.estimate.recalibrate import without_hops
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.moving_axes import unexplained_motion, without_motion
+from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.nulls.scores import null_scores
+from gyrostab.diagnose.reduce.aligned_channels import align_channels
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result.attribution import unexpected
+from gyrostab.diagnose.result.diagnosis import Diagnosis
+from gyrostab.diagnose.result.finish import conclude
 from gyrostab.diagnose.task import Compared, Task, still_lines
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.convert import as_log
@@ -77,7 +77,7 @@ def diagnose(
         Share of records of the simulation itself in which anything may be found.
     block : str or timedelta
     restart_gap : str or float
-        As for `gyrostab.diagnose.reduction.reduced.reduce_log`.
+        As for `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
     progress : Stage
         Is told of the progress.
 

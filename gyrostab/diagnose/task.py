@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.calibration.known import known_motion, without_known_lines
-from gyrostab.diagnose.locating.null_scores import NullScores
-from gyrostab.diagnose.naming.moving import without_motion
-from gyrostab.diagnose.naming.name import Naming
+from gyrostab.diagnose.baseline.known_effects import known_motion, without_known_lines
+from gyrostab.diagnose.identify.forward_search import Naming
+from gyrostab.diagnose.identify.moving_axes import without_motion
+from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.progress import Stage
 from gyrostab.simulate.model import Model
 

@@ -113,7 +113,7 @@ def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     Parameters
     ----------
     surfaces : xarray.Dataset
-        From `gyrostab.diagnose.conclusion.surfaces`: ``avar(case, axis, window, tau)`` [degree2 hour-2].
+        From `gyrostab.diagnose.result.surfaces`: ``avar(case, axis, window, tau)`` [degree2 hour-2].
     content : mapping
         Of the diagnosis; its mismatches are framed.
 

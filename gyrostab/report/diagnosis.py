@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gyrostab.diagnose.conclusion.result import Diagnosis, check_diagnosis
-from gyrostab.diagnose.conclusion.sentences import (
+from gyrostab.diagnose.result.diagnosis import Diagnosis, check_diagnosis
+from gyrostab.diagnose.result.text import (
     axes_text,
     chance_share,
     length_text,

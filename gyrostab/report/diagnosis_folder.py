@@ -9,7 +9,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from gyrostab.diagnose.conclusion.result import Diagnosis, check_diagnosis, model_text
+from gyrostab.diagnose.result.diagnosis import Diagnosis, check_diagnosis, model_text
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.io.datasets import open_dataset, to_netcdf
 from gyrostab.report import write_diagnosis_report

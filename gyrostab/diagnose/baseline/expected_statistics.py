@@ -1,0 +1,93 @@
+"""What a stationary noise is expected to show in the block statistics of a record, with its taper, blocks and gaps."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.predict.linear_model import effective
+from gyrostab.kernels.spectra.expected import expected_powers
+from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
+from gyrostab.noise import HOUR, URAD_PER_S
+
+__all__ = ["NOISE", "band_columns", "common_variance", "line_columns", "noise_powers", "white_variance"]
+
+Array = NDArray[np.float64]
+#: Random terms, in the order of the dimension `noise`.
+NOISE = ("Q", "N", "B", "K")
+
+
+def line_columns(reduced: xr.Dataset) -> Array:
+    """Expected power of every ordinate of a full block for unit squares of Q, N, B, K.
+
+    Returns
+    -------
+    ndarray, shape (line, term)
+        [degree2 hour-2 Hz-1 per squared unit of the noise table].
+    """
+    size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
+    return np.asarray(expected_powers(taper(size), rate, ordinates(size)).T * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR]))
+
+
+def band_columns(reduced: xr.Dataset) -> Array:
+    """Expected band powers of a full block for unit squares of Q, N, B, K.
+
+    Returns
+    -------
+    ndarray, shape (band, term)
+        [degree2 hour-2 Hz-1 per squared unit of the noise table].
+    """
+    each = line_columns(reduced)
+    edges = band_edges(int(reduced.attrs["block_samples"])) - 1
+    return np.stack([each[low:high].mean(axis=0) for low, high in pairwise(edges)])
+
+
+def noise_powers(reduced: xr.Dataset, response: Array | None = None) -> Array:
+    """Expected band powers for unit squares of Q, N, B, K, as the gaps of each block let them be seen.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+    response : ndarray, shape (band,), optional
+        Factor that a filter has put on the noise before samples were lost.
+
+    Returns
+    -------
+    ndarray, shape (axis, block, band, term)
+        [degree2 hour-2 Hz-1 per squared unit of the noise table].
+    """
+    whole = band_columns(reduced).T * (1.0 if response is None else response)
+    return np.stack([effective(one[None, None], reduced) for one in whole], axis=-1)
+
+
+def common_variance(reduced: xr.Dataset) -> tuple[Array, Array]:
+    """Relative variance that all band powers of a block have in common through random gaps, and the shape of what is left.
+
+    Returns
+    -------
+    common : ndarray, shape (axis, block)
+    shape : ndarray, shape (axis, block, band)
+        Of the gamma distribution of each power when the common factor is known.
+    """
+    shape = reduced["shape"].transpose("axis", "block", "band").values
+    near = reduced["neighbours"].transpose("axis", "block").values
+    samples = np.maximum(reduced["samples"].transpose("axis", "block").values, 1)
+    scattered = np.clip(1.0 - np.where(np.isfinite(near), near, 1.0), 0.0, 1.0)
+    weights = taper(int(reduced.attrs["block_samples"]))
+    scattered = np.maximum(scattered - (1.0 - float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())), 0.0)
+    common = 2.0 * scattered / samples
+    common = np.minimum(common, 0.8 / np.where(np.isfinite(shape), shape, 0.0).max(axis=2, initial=1e-9))
+    return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
+
+
+def white_variance(reduced: xr.Dataset, square: Array) -> Array:
+    """Variance of block means by Q and N, shape (axis, block) [degree2 hour-2], for squares of shape (axis, 4)."""
+    samples = reduced["samples"].transpose("axis", "block").values.astype(np.float64)
+    near = reduced["neighbours"].transpose("axis", "block").values
+    rate, count = float(reduced.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
+    apart = 1.0 - np.where(np.isfinite(near), near, samples / float(reduced.attrs["block_samples"]))
+    runs = np.maximum(apart, 0.0) * count + 1.0  # each leaves a rounding of the angle at either end
+    return np.asarray(HOUR * rate * square[:, 1:2] / count + 2.0 * URAD_PER_S**2 * rate**2 * square[:, :1] * runs / count**2)

@@ -1,0 +1,98 @@
+"""The noise level of a simulation, calibrated on quiet stretches of the recording."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.baseline.expected_statistics import common_variance
+from gyrostab.diagnose.baseline.posterior import Posterior
+from gyrostab.errors import SchemaError
+
+__all__ = ["quiet_level", "scaled_noise"]
+
+Array = NDArray[np.float64]
+_ROUNDS = 20  # of Fisher scoring, which converges quadratically
+_LEAST = 0.1  # of the factor before, below which no round takes it: the power of noise is positive
+
+
+def quiet_level(reduced: xr.Dataset, noise: Array, added: Array, quiet: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Measure how loud the noise of the quiet blocks is against that of a simulation.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        Recording, from `reduce_log`.
+    noise, added : ndarray, shape (axis, block, band)
+        Expected power of the noise, and what effects of the simulation add to it.
+    quiet : ndarray of bool, shape (axis, block)
+        Blocks to calibrate on.
+
+    Returns
+    -------
+    factor : ndarray, shape (axis,)
+        Factor of `noise` of largest gamma likelihood.
+    error : ndarray, shape (axis,)
+        Its standard error, as a share of it.
+
+    Raises
+    ------
+    SchemaError
+        When an axis has no spectrum in its quiet blocks.
+    """
+    power, shape = (reduced[name].transpose("axis", "block", "band").values for name in ("power", "shape"))
+    common, alone = common_variance(reduced)
+    found = []
+    for row, axis in enumerate(reduced["axis"].values):
+        good = np.isfinite(power[row]) & np.isfinite(shape[row]) & quiet[row][:, None]
+        good &= noise[row] > 0.0
+        if not good.any():
+            raise SchemaError(
+                f"axis {axis}: the quiet blocks hold no spectrum to calibrate the simulation on; "
+                "name other quiet time, or leave --quiet out to take the simulation as it is"
+            )
+        own = np.where(good, alone[row], 0.0).sum(axis=1)
+        less = 1.0 / (1.0 + np.where(quiet[row], common[row], 0.0) * own)  # see `common_variance`
+        weight = (shape[row] * np.broadcast_to(less[:, None], good.shape))[good]
+        found.append(_fit_factor(power[row][good], noise[row][good], added[row][good], weight))
+    return np.array([one for one, _ in found]), np.array([error for _, error in found])
+
+
+def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:
+    """Fit ``factor * noise + added`` to powers of gamma laws, by Fisher scoring; the second number is its relative error."""
+    factor = float((weight * power / (noise + added)).sum() / weight.sum())
+    information = 0.0
+    for _ in range(_ROUNDS):
+        expected = factor * noise + added
+        information = float((weight * (noise / expected) ** 2).sum())
+        moved = float((weight * noise * (power - expected) / expected**2).sum()) / information
+        factor = max(factor + moved, _LEAST * factor)
+    return factor, 1.0 / (factor * math.sqrt(information))
+
+
+def scaled_noise(noise: Posterior, factor: float, error: float, rng: np.random.Generator) -> Posterior:
+    """Scale the noise of an axis, with the error of the scale in its draws.
+
+    Parameters
+    ----------
+    noise : Posterior
+        Noise of the simulation.
+    factor : float
+        Factor of its power.
+    error : float
+        Standard error of `factor`, as a share of it.
+    rng : numpy.random.Generator
+        Random numbers of the draws.
+    """
+    scatter = rng.gamma(error**-2, error**2, (len(noise.draws), 1))
+    return noise._replace(
+        square=noise.square * factor,
+        error=np.hypot(noise.error, noise.square * error) * factor,
+        K=noise.K * np.sqrt(factor),
+        B=noise.B * np.sqrt(factor),
+        draws=noise.draws * factor * scatter,
+        slow=noise.slow * factor * scatter,
+    )

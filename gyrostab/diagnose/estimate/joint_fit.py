@@ -1,0 +1,346 @@
+"""Fit all named effects together: values with honest errors, and the model with the effects in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.estimate.nuisance import sizes_over
+from gyrostab.diagnose.estimate.shared_factors import shared_sizes
+from gyrostab.diagnose.estimate.telegraph_sizes import level_sizes
+from gyrostab.diagnose.identify.equivalents import plainer
+from gyrostab.diagnose.identify.forward_search import Claim, Naming, Unknown
+from gyrostab.diagnose.identify.logger_filters import filter_sizes
+from gyrostab.diagnose.identify.sample_sizes import line_size, mark_sizes
+from gyrostab.diagnose.predict.condition import Part, explain_away, mirrored
+from gyrostab.diagnose.predict.filter_response import is_filter
+from gyrostab.diagnose.predict.linear_model import State, begin_state, harmonic_sets
+from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.reduce.zero_bin import cut_off
+from gyrostab.errors import GyrostabError
+from gyrostab.physics.base import Effect
+from gyrostab.physics.registry import effects
+from gyrostab.physics.rotation import EarthRate
+
+__all__ = ["FORM_ERROR", "Estimate", "Fitted", "fit_claims"]
+
+Array = NDArray[np.float64]
+#: Error of the form of an effect, as a share of its size: no effect is exactly what its equation says.
+FORM_ERROR = 0.04
+_TWO_SIDED = 1.959964
+_ANGLE = "deg"
+_PLACE = "line", "frequency"  # where a line is has nothing to do with what makes it
+_EARTH = 15.041067  # deg/h
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter.
+
+    Attributes
+    ----------
+    value, stderr : float
+    low, high : float
+        Ends of the 95 % interval.
+    unit : str
+    """
+
+    value: float
+    stderr: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A named effect with its numbers, on one axis or on several at once.
+
+    Attributes
+    ----------
+    claim : Claim
+    axes : tuple of str
+    parameters : mapping of str to Estimate
+        Of an effect with a number for each axis: name and axis, with a dot between, where there are several axes.
+    effect : Effect or None
+        With these numbers, as a model takes it; None where they make no effect.
+    note : str
+        What the numbers do not say.
+    """
+
+    claim: Claim
+    axes: tuple[str, ...]
+    parameters: Mapping[str, Estimate]
+    effect: Effect | None
+    note: str = ""
+
+    def say(self) -> str:
+        """Describe the effect with its numbers in one sentence; return an empty string where it has no numbers."""
+        if self.effect is None or not self.parameters:
+            return ""
+        said = self.effect.say({name: one.stderr for name, one in self.parameters.items()})
+        return f"{said} {self.note}" if self.note else said
+
+
+def fit_claims(naming: Naming, baseline: xr.Dataset) -> list[Fitted]:
+    """Fit all named effects, each with the others in the model.
+
+    Parameters
+    ----------
+    naming : Naming
+        From `gyrostab.diagnose.identify.forward_search.name_effects`.
+    baseline : xarray.Dataset
+        That the naming started from.
+
+    Returns
+    -------
+    list of Fitted
+        An entry for each axis of an effect with one number for all of its axes; one entry for all axes where each has its own number.
+    """
+    start = begin_state(naming.state.reduced, baseline)
+    found: list[Fitted] = []
+    for claim in naming.claims:
+        state = start
+        everything: list[Claim | Unknown] = [*naming.expected, *naming.claims, *naming.unknown]
+        for one in everything:
+            if one is not claim:
+                state = explain_away(state, list(one.parts))
+        state = replace(state, weight=naming.state.weight, masked=naming.state.masked)
+        found += _fit_claim(claim, state, naming)
+    return found
+
+
+def _fit_claim(claim: Claim, state: State, naming: Naming) -> list[Fitted]:
+    views = {part.candidate.view for part in claim.parts}
+    kind = effects()[claim.effect]
+    many = any(item.many for item in kind.parameters() if item.name in kind.size_parameters)
+    filtered = any(is_filter(part.candidate.view, part.variant) for part in claim.parts)  # one logger: its axes are filtered alike
+    together = many or filtered or "cross" in views or any(not part.candidate.each for part in claim.parts)
+    if together:
+        return [_fitted(claim, _axes(claim, parts), parts, state, naming) for parts in _by_harmonic(claim, state)]
+    return [_fitted(claim, (axis,), [part for part in claim.parts if axis in part.row], state, naming) for axis in claim.axes]
+
+
+def _axes(claim: Claim, parts: Sequence[Part]) -> tuple[str, ...]:
+    """Axes of the claim on which the parts are."""
+    return tuple(axis for axis in claim.axes if any(axis in part.row for part in parts))
+
+
+def _by_harmonic(claim: Claim, state: State) -> list[list[Part]]:
+    """Parts of a claim; those of several harmonics of the rotation, each of which has a size and a phase of its own, one by one.
+
+    A harmonic beside the strongest is left out where its amplitude is within two standard errors on every axis.
+    """
+    turning = [part for part in claim.parts if part.candidate.view == "order" and part.candidate.each]
+    sets = harmonic_sets(state.reduced.sizes["harmonic"]) if turning else []
+    there = sorted({k for part in turning for k in sets[part.place]})
+    alone = [[replace(part, place=k) for part in turning if k in sets[part.place]] for k in there]
+    if len(alone) < 2:
+        return [list(claim.parts)]
+    clear = [max(size / error for size, error, _ in (_amplitude(part, state) for part in parts)) for parts in alone]
+    kept = [parts for parts, times in zip(alone, clear, strict=True) if times > 2.0 or times == max(clear)]
+    rest = [part for part in claim.parts if part not in turning]
+    return [[*kept[0], *rest], *kept[1:]]
+
+
+def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State, naming: Naming) -> Fitted:
+    kind = effects()[claim.effect]
+    units = {item.name: item.unit for item in kind.parameters()}
+    values: dict[str, Any] = {}
+    estimates: dict[str, Estimate] = {}
+    by_view: dict[str, list[Part]] = {}
+    for part in parts:
+        by_view.setdefault(part.candidate.view, []).append(part)
+    view = max(by_view, key=lambda name: sum(part.gain for part in by_view[name]))
+    plain = [plainer(part, state) for part in by_view[view]]
+    by_view[view] = [part for part, _ in plain]
+    filtered = is_filter(view, by_view[view][0].variant)
+    sizes: Mapping[str, tuple[float, ...]]
+    if filtered:
+        sizes, values = filter_sizes(by_view[view], state)
+    else:
+        own = _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
+        sizes = {**_elsewhere(by_view, view, axes, state, naming), **own}
+    for name, (mean, sd, *ends) in sizes.items():
+        unit = units.get(name.split(".")[0], "1")
+        if math.isfinite(mean) and not math.isnan(sd):  # a low-pass of infinite bandwidth is none; an exponent may be told, not measured
+            form = 0.0 if unit == _ANGLE or (view, name) == _PLACE else FORM_ERROR * mean  # angles have that of the size already
+            estimates[name] = _estimate(mean, sd, unit, ends=ends, positive=_positive(kind, name), form=form)
+        _put(values, name, mean, axes)
+    values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
+    values |= _words(claim, by_view[view][0], state)
+    return Fitted(claim, axes, estimates, _instance(kind, values, axes, claim.driver), next((note for _, note in plain if note), ""))
+
+
+def _elsewhere(
+    by_view: Mapping[str, list[Part]], view: str, axes: tuple[str, ...], state: State, naming: Naming
+) -> dict[str, tuple[float, ...]]:
+    """Sizes on axes that the strongest view says nothing of, from the strongest of the others that does."""
+    seen = {axis for part in by_view[view] for axis in part.row}
+    found: dict[str, tuple[float, ...]] = {}
+    for other in sorted(set(by_view) - {view}, key=lambda name: -sum(part.gain for part in by_view[name])):
+        lacking = {axis for part in by_view[other] for axis in part.row} - seen
+        if lacking:
+            sizes = _SIZES.get(other, _linear)(by_view[other], axes, state, naming)
+            found |= {name: size for name, size in sizes.items() if name.partition(".")[2] in lacking}
+            seen |= lacking
+    return found
+
+
+def _positive(kind: type[Effect], name: str) -> bool:
+    return next((item.low >= 0.0 for item in kind.parameters() if item.name == name.split(".")[0]), False)
+
+
+def _put(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...]) -> None:
+    """A value by its name; "name.axis" goes to its place in a list."""
+    base, _, axis = name.partition(".")
+    if not axis:
+        values[base] = value
+        return
+    known = values.setdefault(base, [0.0] * len(axes))
+    known[axes.index(axis)] = value
+
+
+def _words(claim: Claim, part: Part, state: State) -> dict[str, Any]:
+    """What the model needs beside the numbers."""
+    if claim.effect == "rotation_line":
+        return {"harmonics": 1.0}
+    if claim.effect == "feedback_reset" and "ramp_turns" in state.reduced:
+        low, high = (float(state.reduced["ramp_turns"].attrs[name]) for name in ("low", "high"))
+        return {"phase": "channel", "full": float(part.variant.values.get("full", 1.0)) * (high - low)}
+    if claim.effect == "held_samples":
+        return {"fill": "zero" if part.variant.columns[0] == "filled" else "repeat"}
+    if claim.effect == "rate_quantization" and cut_off(state.reduced)[state.axes.index(part.row[0])]:
+        return {"mode": "zero"}
+    if claim.effect == "spikes":
+        return {"kind": "outlier"}
+    if claim.effect == "earth_rate" and mirrored(part):
+        off, around = np.degrees(EarthRate.example().directions(claim.axes))
+        return {"off": list(off), "around": list(-around)}
+    return {}
+
+
+def _instance(kind: type[Effect], values: Mapping[str, Any], axes: tuple[str, ...], driver: tuple[str, ...]) -> Effect | None:
+    known = {item.name: item for item in kind.parameters()}
+    clean = {}
+    for name, value in values.items():
+        if name in known:
+            item = known[name]
+            clean[name] = value if isinstance(value, str) else _within(value, item.low, item.high)
+    named = tuple(driver) if driver and all(driver) else ()
+    size = {name: 0.0 for name in kind.required() if name not in clean}
+    try:
+        return kind(axes=axes, driver=named, **{**size, **clean})
+    except (GyrostabError, TypeError):
+        return None
+
+
+def _within(value: Any, low: float, high: float) -> Any:
+    if isinstance(value, list | tuple):
+        return [min(max(float(one), low), high) for one in value]
+    return min(max(float(value), low), high)
+
+
+def _estimate(mean: float, sd: float, unit: str, *, positive: bool, form: float, ends: Sequence[float] = ()) -> Estimate:
+    """With the error of the `form` in it; `ends` are those of the 95 % interval without it, where that is not symmetric."""
+    if sd <= 0.0:  # what is counted, not measured, is exact
+        return Estimate(mean, 0.0, mean, mean, unit)
+    low, high = ends or (mean - _TWO_SIDED * sd, mean + _TWO_SIDED * sd)
+    low, high = mean - math.hypot(mean - low, _TWO_SIDED * form), mean + math.hypot(high - mean, _TWO_SIDED * form)
+    return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
+
+
+# ---------------------------------------------------------------------------------------------------------------- sizes
+
+
+def _linear(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
+    """Parameters of means, powers, profiles and transfers; by axis where there are several."""
+    out: dict[str, tuple[float, ...]] = {}
+    for part in parts:
+        if part.variant.columns[:1] == ("any",):
+            continue
+        mean, covariance, nuisance = sizes_over(part, state, naming)
+        for number, name in enumerate(part.variant.columns):
+            value, sd = float(mean[number]), float(math.sqrt(covariance[number, number]))
+            if part.variant.squared:
+                value, sd = _root(value, sd)
+            out[name if len(axes) == 1 else f"{name}.{part.row[0]}"] = (value, sd)
+        out |= nuisance
+    return out
+
+
+def _root(square: float, sd: float) -> tuple[float, float]:
+    """Size and its error from those of the square."""
+    value = math.sqrt(max(square, 0.0))
+    return value, sd / (2.0 * value) if square > sd else math.sqrt(max(square, 0.0) + sd) - value
+
+
+def _common(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
+    return shared_sizes(parts, axes, state)
+
+
+def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
+    """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down.
+
+    Angles have the error of the form that the amplitude has: a share of an angle would be none.
+    """
+    out: dict[str, tuple[float, ...]] = {}
+    for part in parts:
+        size, sd, angle = _amplitude(part, state)
+        error = math.hypot(sd / max(size, 1e-300), FORM_ERROR)
+        if not part.candidate.each:
+            across = size * float(np.abs(part.variant.design).max())
+            return {"latitude": _latitude(across, error * across), "toolface": (angle, math.degrees(error))}
+        label = "" if len(axes) == 1 else f".{part.row[0]}"
+        out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
+        out["order"] = (float(state.reduced["harmonic"].values[part.place % state.reduced.sizes["harmonic"]]), 0.0)
+    return out
+
+
+def _latitude(across: float, error: float) -> tuple[float, float, float, float]:
+    """Latitude [deg], its standard error and the ends of its 95 % interval, by the earth's rate across a tool that points down [deg/h]."""
+    low, middle, high = (
+        math.degrees(math.acos(min(max(rate, 0.0) / _EARTH, 1.0)))
+        for rate in (across + _TWO_SIDED * error, across, across - _TWO_SIDED * error)
+    )
+    return middle, max((high - low) / (2.0 * _TWO_SIDED), 1e-12), low, high
+
+
+def _amplitude(part: Part, state: State) -> tuple[float, float, float]:
+    """Amplitude of the first harmonic of a part, its standard error, and the phase [deg]."""
+    mean, covariance = part_mixture(part, state).moments()
+    sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
+    return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
+
+
+def _line(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    name = {"real_motion": "sway"}.get(parts[0].candidate.effect, parts[0].variant.columns[0])
+    out: dict[str, tuple[float, float]] = {}
+    for part in sorted(parts, key=lambda part: part.gain):  # of several lines of an axis the strongest
+        amplitude, frequency = line_size(state.reduced, part.row[0], part.place)
+        label = "" if len(axes) == 1 or name == "sway" else f".{part.row[0]}"
+        out[f"{name}{label}"], out["frequency"] = amplitude, frequency
+    return out
+
+
+def _odd(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    return mark_sizes(parts[0].candidate.effect, parts[0].variant.columns[0], parts[0].row[0], state.reduced, naming.tallies)
+
+
+def _levels(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+    return level_sizes(parts, axes, state)
+
+
+_SIZES: Mapping[str, Callable[..., Mapping[str, tuple[float, ...]]]] = {
+    "cross": _common,
+    "order": _turning,
+    "line": _line,
+    "marks": _odd,
+    "levels": _levels,
+}

@@ -1,0 +1,48 @@
+"""What odd samples add to the powers on average: naming leaves their blocks out, a picture of the simulation must not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.estimate.joint_fit import Fitted
+from gyrostab.diagnose.predict.candidates import windows_of
+from gyrostab.diagnose.predict.designs import term_density
+
+__all__ = ["with_odd_power"]
+
+_IN_ALL = "lattice"  # odd about every sample, so that the noise that was calibrated has it already
+
+
+def with_odd_power(baseline: xr.Dataset, reduced: xr.Dataset, fitted: Sequence[Fitted]) -> xr.Dataset:
+    """The baseline with the mean power of spikes, held samples and other odd samples, as their fitted numbers and their physics say.
+
+    Parameters
+    ----------
+    baseline : xarray.Dataset
+        With the other effects, fitted to the blocks without odd samples.
+    reduced : xarray.Dataset
+    fitted : sequence of Fitted
+        Effects of all kinds; those that leave no odd samples are passed over.
+    """
+    axes = [str(axis) for axis in reduced["axis"].values]
+    frequency, rate = reduced["frequency"].values, float(reduced.attrs["sampling_rate_hz"])
+    spectrum = baseline["spectrum"].transpose("axis", "block", "band")
+    added = np.zeros(spectrum.shape)
+    for one in fitted:
+        if one.effect is None or not any(part.candidate.view == "marks" for part in one.claim.parts):
+            continue
+        rows = [axes.index(axis) for axis in one.axes]
+        seen = one.effect.explain(replace(windows_of(reduced, {}), axes=tuple(one.axes)))
+        if _IN_ALL in seen.marks:
+            continue
+        for name, density in seen.spectrum.items():
+            added[rows] += getattr(one.effect, name) ** 2 * density
+        for (term, name), share in seen.level.items():
+            square = baseline["coefficient"].sel(term=term, axis=list(one.axes)).values ** 2
+            own = square[:, None] * getattr(one.effect, name) * share
+            added[rows] += own[..., None] * term_density(term, frequency, rate)
+    return baseline.assign(spectrum=spectrum.copy(data=spectrum.values + added)) if added.any() else baseline

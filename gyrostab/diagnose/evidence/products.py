@@ -1,0 +1,282 @@
+"""Products of whitened data and designs, and what they say of a design whose size is unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.folds import FOLDS
+from gyrostab.diagnose.evidence.wandering import Wander
+from gyrostab.kernels.regression.evidence import chosen_products, mixed_evidence
+from gyrostab.kernels.regression.state_space import flicker_states, whiten
+from gyrostab.noise import HOUR
+
+__all__ = [
+    "WIDTHS",
+    "Array",
+    "Products",
+    "evidence",
+    "limits_of",
+    "mean_products",
+    "pairs_of",
+    "power_products",
+    "score",
+    "share_out",
+    "take_out",
+]
+
+Array = NDArray[np.float64]
+#: Standard deviations of the prior of a factor, in errors that it would have in white noise.
+WIDTHS = (1.0, 10.0, 100.0, 1000.0)
+#: A design that keeps less than this share of its square beside constants and given columns is not there.
+_NOTHING = 1e-9
+_AT_ONCE = 10_000  # designs times records times grid points whose evidence is worked out at once
+
+
+@dataclass(frozen=True)
+class Products:
+    """Products of whitened data and columns on some of the blocks; one grid point where there is no grid.
+
+    Attributes
+    ----------
+    square : ndarray, shape (grid, record)
+        ``y' y``.
+    cross : ndarray, shape (grid, column, record)
+        ``x' y``.
+    gram : ndarray, shape (grid, column, column)
+        ``x' x``.
+    log_determinant : ndarray, shape (grid,)
+        Of the covariance.
+    """
+
+    square: Array
+    cross: Array
+    gram: Array
+    log_determinant: Array
+
+
+def take_out(products: Products, given: int, precision: Array) -> Products:
+    """Take the last `given` columns out: they are in every model, with normal priors of this precision (given, given)."""
+    if not given:
+        return products
+    keep = slice(None, products.gram.shape[1] - given)
+    out = slice(products.gram.shape[1] - given, None)
+    inner = products.gram[:, out, out] + precision
+    to_x = np.linalg.solve(inner, products.gram[:, out, keep])
+    to_y = np.linalg.solve(inner, products.cross[:, out])
+    return Products(
+        square=products.square - (products.cross[:, out] * to_y).sum(axis=1),
+        cross=products.cross[:, keep] - products.gram[:, keep, out] @ to_y,
+        gram=products.gram[:, keep, keep] - products.gram[:, keep, out] @ to_x,
+        log_determinant=products.log_determinant + np.linalg.slogdet(inner)[1] - np.linalg.slogdet(precision)[1],
+    )
+
+
+def limits_of(before: Array, after: Array) -> Array:
+    """Error of the factor of every column in white noise [1 / unit of the column], 0 where there is nothing to see.
+
+    `before` and `after` are the squares of the columns, and what is left of them beside the constant and the given columns.
+    """
+    seen = after > _NOTHING * np.maximum(before, np.finfo(float).tiny)
+    return np.where(seen, 1.0 / np.sqrt(np.where(seen, after, 1.0)), 0.0)
+
+
+def mean_products(
+    values: Array,
+    columns: Array,
+    *,
+    variance: Array,
+    step: float,
+    K: Array,
+    B: Array,
+    present: NDArray[np.bool_],
+    pairs: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
+    wander: Wander | None = None,
+) -> Products:
+    """Products of block means and columns, whitened for every pair of K and B.
+
+    Parameters
+    ----------
+    values : ndarray, shape (block, record)
+        Block means [degree hour-1]; anything where not `present`.
+    columns : ndarray, shape (block, column)
+        Designs.
+    variance : ndarray, shape (block,)
+        White variance of the means [degree2 hour-2].
+    step : float
+        Length of a block [s].
+    K, B : ndarray, shape (grid,)
+        Random walk [deg/h^1.5] and flicker [deg/h].
+    present : ndarray of bool, shape (block,)
+        Blocks that are used.
+    pairs : two ndarrays, optional
+        Columns whose products with each other are asked for, from `pairs_of`; all by default. The other products stay 0.
+    wander : Wander, optional
+        What is there beside, whatever K and B are.
+    """
+    n, width = columns.shape
+    both = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
+    both[~present] = 0.0
+    spread = np.where(present, variance, 1.0)
+    share, time, white = flicker_states(step, n * step)
+    steps, walk = np.full(n, step), np.zeros(n)
+    if wander is not None:
+        walk = walk + wander.walk
+    shape = (K.size, values.shape[1])
+    square, cross = np.empty(shape), np.empty((K.size, width, shape[1]))
+    gram, determinant = np.zeros((K.size, width, width)), np.empty(K.size)
+    for g, (k, b) in enumerate(zip(K**2 / HOUR, B**2, strict=True)):
+        states = (share * b, time) if b > 0.0 else (share[:0], time[:0])
+        if wander is not None:
+            states = (np.append(states[0], wander.square), np.append(states[1], wander.time))
+        done, determinant[g] = whiten(both, spread + b * white, steps, present, k + walk, *states)
+        x, y = done[:, :width], done[:, width:]
+        cross[g], square[g] = x.T @ y, np.einsum("ij,ij->j", y, y)
+        if pairs is None:
+            gram[g] = x.T @ x
+        else:
+            gram[g][pairs] = gram[g][pairs[::-1]] = chosen_products(done, *pairs)
+    return Products(square, cross, gram, determinant)
+
+
+def pairs_of(width: int, designs: Sequence[NDArray[np.int64]], given: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of columns that meet in a model: each and itself, those of a design, and the last `given` and any other."""
+    wanted = np.eye(width, dtype=np.bool_)
+    wanted[:, width - given :] = True
+    for chosen in designs:
+        wanted[np.ix_(chosen, chosen)] = True
+    first, second = np.nonzero(np.triu(wanted))
+    return first, second
+
+
+def power_products(residual: Array, weight: Array, columns: Array) -> Products:
+    """Products of relative band powers and columns, cells weighted by their shape.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (cell, record)
+        ``power / spectrum - 1``.
+    weight : ndarray, shape (cell,)
+        Shape of the gamma distribution of the power; 0 where there is none, where `residual` may be anything finite.
+    columns : ndarray, shape (cell, column)
+        Relative change of the spectrum for a unit of each factor.
+    """
+    weighted = (columns * weight[:, None]).T
+    square = weight @ (residual * residual)
+    return Products(square[None], (weighted @ residual)[None], (weighted @ columns)[None], np.zeros(1))
+
+
+def share_out(values: Array, weight: Array, common: Array, unit: Array | None = None) -> Array:
+    """Take from the cells of each block so much of their common part that they are as good as independent.
+
+    Under random gaps the powers of all bands of a block rise and fall together: their covariance is ``1 / weight`` on the diagonal,
+    and ``common`` times the product of the units everywhere. Products of columns that went through here are those of that covariance.
+
+    Parameters
+    ----------
+    values : ndarray, shape (block, cell, column)
+        Data or designs.
+    weight : ndarray, shape (block, cell)
+        One over the variance that is not common; 0 where there are no data.
+    common : ndarray, shape (block,)
+        Variance of the common part.
+    unit : ndarray, shape (block, cell), optional
+        How strong it is in each cell, 1 by default.
+
+    Examples
+    --------
+    >>> weight, values = np.array([[4.0, 1.0]]), np.array([[[1.0], [3.0]]])
+    >>> free = share_out(values, weight, np.array([0.5]))
+    >>> float((weight[..., None] * free**2).sum().round(9))
+    6.0
+    >>> float((values[0].T @ np.linalg.inv([[0.75, 0.5], [0.5, 1.5]]) @ values[0])[0, 0].round(9))
+    6.0
+    """
+    one = np.ones_like(weight) if unit is None else unit
+    total = (weight * one**2).sum(axis=1)
+    taken = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(total > 0.0, total, 1.0)
+    part = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
+    return np.asarray(values - one[..., None] * part[:, None])
+
+
+def evidence(products: Products, designs: Sequence[NDArray[np.int64]], limits: Array, log_weight: Array) -> Array:
+    """Log marginal likelihood without any design, and with each.
+
+    Parameters
+    ----------
+    products : Products
+    designs : sequence of ndarray
+        Numbers of the columns of each design.
+    limits : ndarray, shape (column,)
+        Error of every factor in white noise; 0 for columns that do nothing.
+    log_weight : ndarray, shape (grid,)
+        Logarithm of the weight of every grid point.
+
+    Returns
+    -------
+    ndarray, shape (1 + design, record)
+    """
+    weight = log_weight - np.logaddexp.reduce(log_weight)
+    base = np.ascontiguousarray((weight[:, None] - 0.5 * (products.square + products.log_determinant[:, None])).T)
+    out = np.empty((1 + len(designs), base.shape[0]))
+    out[0] = np.logaddexp.reduce(base, axis=1)
+    at_once = max(1, _AT_ONCE // max(base.size, 1))
+    for width in sorted({chosen.size for chosen in designs}):
+        alike = [number for number, chosen in enumerate(designs) if chosen.size == width]
+        for first in range(0, len(alike), at_once):
+            several = alike[first : first + at_once]
+            out[1 + np.array(several)] = _alike_evidence(products, np.stack([designs[number] for number in several]), limits, base)
+    return out
+
+
+def _alike_evidence(products: Products, chosen: NDArray[np.int64], limits: Array, base: Array) -> Array:
+    """Log marginal likelihood (design, record) of designs of so many columns each, `chosen` (design, column)."""
+    scale = limits[chosen]
+    gram = products.gram[:, chosen[:, :, None], chosen[:, None, :]] * (scale[:, :, None] * scale[:, None, :])
+    rotated = products.cross[:, chosen] * scale[..., None]
+    if chosen.shape[1] == 1:
+        eigenvalues = gram[..., 0]
+    else:
+        eigenvalues, vectors = np.linalg.eigh(gram)
+        rotated = vectors.swapaxes(2, 3) @ rotated
+    squares = np.ascontiguousarray(np.maximum(eigenvalues, 0.0).swapaxes(0, 1))
+    return mixed_evidence(base, np.ascontiguousarray(rotated.transpose(1, 3, 0, 2)), squares, np.square(WIDTHS))
+
+
+def score(factors: Array, owner: Sequence[int] | NDArray[np.int64], *, weight: Sequence[float] | None = None, folds: int = FOLDS) -> Array:
+    """Held-out gain of candidates, the largest over the lengths of the folds.
+
+    Parameters
+    ----------
+    factors : ndarray, shape (subset, design, record)
+        Logarithms of Bayes factors [nats] on the subsets of `fold_subsets`, without the column of the evidence of none. Factors of
+        data that are independent, as means and powers, may be added before.
+    owner : sequence of int, shape (design,)
+        Number of the candidate to which each design belongs.
+    weight : sequence of float, shape (design,), optional
+        Chance of each design before the data are seen, against the others of its candidate; all alike by default.
+
+    Returns
+    -------
+    ndarray, shape (candidate, record)
+        Sum over the folds of log Bayes factor on all less that on all but the fold [nats].
+
+    Examples
+    --------
+    >>> factors = np.zeros((5, 2, 1))
+    >>> factors[0, 1], factors[1:, 1] = 8.0, 6.0
+    >>> [float(score(factors, [0, 0], weight=share)[0, 0].round(2)) for share in ([1.0, 1.0], [1.0, 9.0])]
+    [7.99, 8.0]
+    """
+    owner = np.asarray(owner)
+    chance = np.zeros(owner.size) if weight is None else np.log(np.asarray(weight, dtype=np.float64))
+    out = []
+    for candidate in range(int(owner.max()) + 1 if owner.size else 0):
+        chosen = owner == candidate
+        own = chance[chosen] - np.logaddexp.reduce(chance[chosen])
+        mixed = np.logaddexp.reduce(factors[:, chosen] + own[:, None], axis=1)
+        out.append((mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1).max(axis=0))
+    return np.array(out).reshape(len(out), factors.shape[2])

@@ -1,0 +1,79 @@
+"""Effects that the simulation has as well, and whose size or course only the recording tells: odd samples, lines of the turning, levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from gyrostab.diagnose.identify.components import LEAST, axes_of, by_key, gain_sum
+from gyrostab.diagnose.identify.identification import Claim
+from gyrostab.diagnose.predict.candidates import Candidate
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import Found
+from gyrostab.physics.base import Effect
+
+__all__ = ["expected_claims"]
+
+_ROUNDS = 6
+_ONCE = {"telegraph": "bias_jump"}  # a hop that does not come back
+
+
+def expected_claims(
+    known: Sequence[Effect], candidates: Sequence[Candidate], start: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
+) -> tuple[list[Claim], State]:
+    """Claims of effects that are expected, and the state with them in it; whatever else is named has to stand beside them.
+
+    Their sizes are free, for the model says how often something happens and the recording when. The strongest comes first, but odd
+    samples before all: they raise powers and means too. An effect that holds several parts of a kind, as two jumps or two lines do, is
+    taken as often as it brings something.
+
+    Parameters
+    ----------
+    known : sequence of Effect
+        Effects of the model that its baseline leaves out.
+    candidates : sequence of Candidate
+        All that are tried on this recording.
+    start : State
+        With nothing named.
+    gains : callable
+        Gains of candidates in a state.
+    """
+    claims: list[Claim] = []
+    state, left = start, list(known)
+    rounds = _ROUNDS * len(left)
+    while left and rounds > 0:
+        rounds -= 1
+        found = [(_parts(effect, candidates, state, gains), effect) for effect in left]
+        left = [effect for parts, effect in found if gain_sum(parts) > LEAST]
+        parts, effect = max(found, key=lambda one: (_odd(one[0]), gain_sum(one[0])))
+        if gain_sum(parts) <= LEAST:
+            break
+        claims.append(_claim(parts, state))
+        state = explain_away(state, parts)
+        if _odd(parts):  # their counts cannot be taken out
+            left = [one for one in left if one is not effect]
+    return claims, state
+
+
+def _odd(parts: Sequence[Part]) -> bool:
+    return bool(parts) and parts[0].candidate.view == "marks" and gain_sum(parts) > LEAST
+
+
+def _follows(candidate: Candidate, effect: Effect) -> bool:
+    """Whether a candidate is this effect of a model, with the channels that it has there; or what it is where it happens once."""
+    named = {*filter(None, candidate.driver)}
+    return candidate.effect in (effect.name, _ONCE.get(effect.name)) and named <= {*effect.channel_names().values()}
+
+
+def _parts(
+    effect: Effect, candidates: Sequence[Candidate], state: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
+) -> list[Part]:
+    """What an effect brings on its axes, in the views and with the channels in which it brings most."""
+    by = by_key(gains([one for one in candidates if _follows(one, effect)], state))
+    own = [[part for part in parts if not effect.axes or set(part.row) <= set(effect.axes)] for parts in by.values()]
+    return max(own, key=gain_sum, default=[])
+
+
+def _claim(parts: Sequence[Part], state: State) -> Claim:
+    first = parts[0].candidate
+    return Claim(first.effect, first.driver, axes_of(parts, state.axes), tuple(parts), gain_sum(parts), LEAST)

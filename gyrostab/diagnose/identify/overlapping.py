@@ -1,0 +1,57 @@
+"""Claims that hold the same row of a view more than once, as two jumps of one bias: each part is judged beside those before it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+from gyrostab.diagnose.identify.components import by_key, tried_again
+from gyrostab.diagnose.predict.candidates import Candidate
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import Found
+
+__all__ = ["found_again", "layers"]
+
+
+def layers(parts: Sequence[Part]) -> list[list[Part]]:
+    """Parts by how often their view, row and witness have come before."""
+    out: list[list[Part]] = []
+    seen: Counter[tuple[object, ...]] = Counter()
+    for part in parts:
+        place = part.candidate.view, part.row, part.candidate.witness
+        if seen[place] == len(out):
+            out.append([])
+        out[seen[place]].append(part)
+        seen[place] += 1
+    return out
+
+
+def found_again(
+    parts: Sequence[Part], first: Sequence[Part], state: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
+) -> list[list[Part]]:
+    """For each layer of a claim what is found of it anew with the layers before it in the model.
+
+    What several variants explain together is no gain of one of them: the first of two opposite jumps explains little alone.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Of the claim.
+    first : sequence of Part
+        What was found of it with nothing of the claim in the model.
+    state : State
+        With all other claims in the model.
+    gains : callable
+        Gains of candidates in a state.
+    """
+    out = [list(first)]
+    weight, key = state.weight, parts[0].candidate.key
+    axes = {axis for part in parts for axis in part.row}
+    for before, layer in pairwise(layers(parts)):
+        state = replace(explain_away(state, before), weight=weight)
+        again = by_key(gains(tried_again(layer), state)).get(key, [])
+        out.append([part for part in again if set(part.row) & axes])
+    return out

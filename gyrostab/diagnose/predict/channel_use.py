@@ -1,0 +1,106 @@
+"""Which channels of a recording no effect can use, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.reduce.aligned_channels import TURNING
+from gyrostab.physics.registry import effects
+
+__all__ = ["CALIBRATION_CHANNELS", "MIN_BLOCK_SHARE", "missing_channel_reason", "unused_channels"]
+
+#: Share of the blocks in which a channel must have values.
+MIN_BLOCK_SHARE = 0.5
+#: Beginnings of the names of channels that choose the quiet stretches.
+CALIBRATION_CHANNELS = ("vibration", "temperature", "rotation_rate")
+
+
+def missing_channel_reason(channels: Collection[str], reduced: xr.Dataset) -> str:
+    """Say why none of the channels that an effect follows can be used.
+
+    Parameters
+    ----------
+    channels : collection of str
+        Channels of the effect.
+    reduced : xarray.Dataset
+        From `reduce_log`.
+    """
+    unused: Mapping[str, str] = reduced.attrs.get("unused_channels", {})
+    for name in channels:
+        if name in unused:
+            return f"the channel {name} is not used: {unused[name]}"
+        if problem := _problem(name, reduced):
+            return f"the channel {name} is not used: {problem}"
+    return f"the recording has no channel {' or '.join(channels)}"
+
+
+def unused_channels(reduced: xr.Dataset, used: Iterable[str]) -> list[dict[str, str]]:
+    """List the channels that took no part in a diagnosis.
+
+    Parameters
+    ----------
+    reduced : xarray.Dataset
+        From `reduce_log`; its attribute ``unused_channels`` has those that were left out before.
+    used : iterable of str
+        Channels that some candidate follows or is compared with.
+
+    Returns
+    -------
+    list of dict
+        ``name`` and ``reason`` of each.
+    """
+    found = dict(reduced.attrs.get("unused_channels", {}))
+    known = set(used)
+    for variable in map(str, reduced.data_vars):
+        name = variable.removeprefix("channel_")
+        if name == variable or name in known:
+            continue
+        problem = _problem(name, reduced)
+        if problem or not name.startswith(CALIBRATION_CHANNELS):
+            found[name] = problem or _stranger(name, reduced)
+    return [{"name": name, "reason": reason} for name, reason in found.items()]
+
+
+def _problem(name: str, reduced: xr.Dataset) -> str:
+    """Say what is wrong with the values or the unit of a channel; empty for nothing."""
+    variable = f"channel_{name}"
+    if variable not in reduced:
+        return ""
+    values = reduced[variable].values
+    share = float(np.isfinite(values).mean())
+    if share < MIN_BLOCK_SHARE:
+        return f"it has values in {share:.0%} of the blocks, and {MIN_BLOCK_SHARE:.0%} are needed"
+    unit, wanted = str(reduced[variable].attrs.get("units", "")), _wanted_units(name)
+    if wanted and unit not in wanted:
+        return f"its unit is {unit!r}, and effects need {' or '.join(map(repr, wanted))}; give it with --unit {name}=UNIT"
+    if np.nanmax(values) == np.nanmin(values) and not _is_compared(name, reduced):
+        return "it does not change"
+    return ""
+
+
+def _wanted_units(name: str) -> list[str]:
+    """Units in which effects follow a channel of this name, or of the beginning of it."""
+    found: dict[str, None] = {}
+    for kind in effects().values():
+        for channel, unit in kind.channels.items():
+            base = channel.rstrip("0123456789").rstrip("_")
+            if name in (channel, base):
+                found[unit] = None
+    return list(found)
+
+
+def _is_compared(name: str, reduced: xr.Dataset) -> bool:
+    """Return whether a channel lies on the time of the gyro, so that their spectra can be compared."""
+    return "witness" in reduced.dims and name in reduced["witness"].values
+
+
+def _stranger(name: str, reduced: xr.Dataset) -> str:
+    if _is_compared(name, reduced) or _wanted_units(name):
+        return "no effect that this record can show follows it"
+    if name.startswith(TURNING):
+        return "no effect follows a channel of this name; lines at the rotation are found with the channel rotation_rate"
+    rate = float(reduced.attrs["sampling_rate_hz"])
+    return f"no effect follows a channel of this name, and it is too slow to be compared with the gyro sample by sample ({rate:.4g} Hz)"

@@ -1,0 +1,129 @@
+"""Sizes of linear parameters and their errors, averaged over the noise: of block means by least squares, of cells by weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.products import mean_products
+from gyrostab.diagnose.evidence.wandering import known_wander
+from gyrostab.diagnose.predict.candidates import Variant
+from gyrostab.diagnose.predict.condition import Part, mean_columns
+from gyrostab.diagnose.predict.linear_model import State, cells_of, view_rows
+
+__all__ = ["Mixture", "mean_mixture", "part_mixture", "part_size"]
+
+Array = NDArray[np.float64]
+_RIDGE = 1e-12
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A mixture of normal laws of some sizes.
+
+    Attributes
+    ----------
+    log_weight : ndarray, shape (point,)
+        Not normalised.
+    mean : ndarray, shape (point, size)
+    covariance : ndarray, shape (point, size, size)
+    """
+
+    log_weight: Array
+    mean: Array
+    covariance: Array
+
+    def weights(self) -> Array:
+        """Probabilities of the points."""
+        return np.asarray(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)))
+
+    def moments(self) -> tuple[Array, Array]:
+        """Mean and covariance of the whole."""
+        weight = self.weights()
+        mean = weight @ self.mean
+        apart = self.mean - mean
+        return mean, np.einsum("g,gij->ij", weight, self.covariance) + np.einsum("g,gi,gj->ij", weight, apart, apart)
+
+
+def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str = "free", variance: Array | None = None) -> Mixture:
+    """Sizes of columns of the block means on an axis, over the grid of random walk and flicker; given columns are free beside them.
+
+    Parameters
+    ----------
+    state : State
+    axis : str
+    columns : sequence of ndarray, shape (block,)
+    tier : {"free", "calibrated"}
+        What the noise may be, as in `gyrostab.diagnose.evidence.held_out.mean_factors`.
+    variance : ndarray, shape (block,), optional
+        White variance of the means in place of that of the baseline [degree2 hour-2].
+    """
+    baseline = state.baseline
+    row = state.axes.index(axis)
+    y = (state.reduced["mean"] - baseline["known_mean"]).transpose("axis", "block").values[row]
+    every = [*columns, *state.given.get(("mean", axis), [])]
+    whole = np.stack(every, axis=1) if every else np.empty((y.size, 0))
+    present = np.isfinite(y)
+    size = np.abs(whole - whole.mean(axis=0)).max(axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    grid: dict[str, Any] = {"K": baseline["grid_K"].sel(axis=axis).values, "B": baseline["grid_B"].sel(axis=axis).values}
+    products = mean_products(
+        np.where(present, y, 0.0)[:, None],
+        whole / size,
+        variance=baseline["mean_variance"].sel(axis=axis).values if variance is None else variance,
+        step=float(state.reduced.attrs["block_s"]),
+        present=present,
+        wander=known_wander(baseline, axis),
+        **grid,
+    )
+    prior = baseline["grid_prior" if tier == "free" else "grid_calibrated"].sel(axis=axis).values
+    own = len(columns)
+    gram = products.gram + _RIDGE * np.eye(whole.shape[1]) * (1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None])
+    covariance = np.linalg.inv(gram)
+    mean = np.einsum("gij,gj->gi", covariance, products.cross[:, :, 0])
+    fitted = (mean * products.cross[:, :, 0]).sum(axis=1)
+    log_weight = prior - 0.5 * (products.square[:, 0] - fitted + products.log_determinant + np.linalg.slogdet(gram)[1])
+    scale = size[:own]
+    return Mixture(log_weight, mean[:, :own] / scale, covariance[:, :own, :own] / np.outer(scale, scale))
+
+
+def part_mixture(part: Part, state: State, variant: Variant | None = None, *, variance: Array | None = None) -> Mixture:
+    """Sizes of a part's columns, in the unit of the parameters (or their squares), when `state` is in the model beside it."""
+    variant = variant or part.variant
+    if part.candidate.view in ("mean", "levels"):
+        row = state.axes.index(part.row[0])
+        return mean_mixture(state, part.row[0], mean_columns(variant, row), variance=variance)
+    candidate = replace(part.candidate, variants=(variant,))
+    row = view_rows(candidate, state).index(part.row)
+    cells = cells_of([candidate], row, state.reduced, state)
+    design = cells.designs[max(part.place, 0) if part.candidate.view == "order" else 0]
+    columns = np.concatenate([design, cells.given], axis=2).reshape(-1, design.shape[2] + cells.given.shape[2])
+    weight = np.where(np.isfinite(cells.weight) & np.isfinite(cells.values[..., 0]), cells.weight, 0.0).ravel()
+    values = np.where(weight > 0.0, np.nan_to_num(cells.values[..., 0]).ravel(), 0.0)
+    columns = np.where(np.isfinite(columns), columns, 0.0)
+    size = np.sqrt(np.maximum((weight[:, None] * columns**2).sum(axis=0), 1e-300))
+    columns = columns / size
+    own = design.shape[2]
+    known = np.diagonal(cells.precision)
+    prior = np.concatenate([np.zeros(own), np.where(known < 0.0, 0.0, known) / size[own:] ** 2])
+    normal = (columns * weight[:, None]).T @ columns + np.diag(prior + 1e-9)
+    moved = columns.T @ (weight * values)
+    covariance = np.linalg.inv(normal)
+    mean = covariance @ moved
+    log_weight = 0.5 * mean @ moved - 0.5 * np.linalg.slogdet(normal)[1]
+    scale = size[:own]
+    with np.errstate(over="ignore"):  # of a column that is nowhere but 0 the record says nothing: its variance is infinite
+        own_covariance = covariance[:own, :own] / np.outer(scale, scale)
+    return Mixture(np.array([log_weight]), (mean[:own] / scale)[None], own_covariance[None])
+
+
+def part_size(part: Part, state: State) -> tuple[float, float]:
+    """Size of the first column and its standard error; zero and infinite for a view that has no size."""
+    if part.candidate.view in ("marks", "line", "wander"):
+        return 0.0, np.inf
+    mean, covariance = part_mixture(part, state).moments()
+    return float(mean[0]), float(np.sqrt(covariance[0, 0]))

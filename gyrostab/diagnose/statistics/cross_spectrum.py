@@ -1,0 +1,113 @@
+"""What two axes share, of which the Allan variance of one axis shows nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, values_of, view_dataset, window_set
+
+__all__ = ["LENGTHS", "correlation_score", "score"]
+
+Complex = NDArray[np.complex128]
+
+#: Lengths of the windows [blocks]; the record as a whole is one more.
+LENGTHS = (5, 15, 45)
+_FEWEST = 8.0  # complex ordinates; with fewer a coherency is no number to judge by
+
+
+def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+    """Score the coherency of every pair of axes, in bands and over all bands, against independent axes.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        Recording or null records, and what the simulation expects: the bands are weighed by its spectrum, and a ``cross`` (pair,
+        block, band) that the axes share by it is taken off.
+
+    Returns
+    -------
+    xarray.Dataset or None
+        None with one axis. Columns ``in phase`` and ``in quadrature``; ``ratio`` is the coherency, and ``estimate`` too. Three
+        axes or more have a row of all pairs together, over all bands in phase.
+    """
+    if "cross" not in reduced or reduced.sizes.get("pair", 0) == 0:
+        return None
+    axes = [str(axis) for axis in reduced["axis"].values]
+    left = [axes.index(str(axis)) for axis in reduced["first"].values]
+    right = [axes.index(str(axis)) for axis in reduced["second"].values]
+    windows = window_set(reduced.sizes["block"], LENGTHS)
+    coherency, count = _coherency(reduced, baseline, left, right, windows)
+    parts = [coherency.real, coherency.imag]
+    r = np.concatenate(parts, axis=-1)
+    z = correlation_score(r, np.concatenate([2.0 * count] * 2, axis=-1))
+    rows = [f"{axes[a]} {axes[b]}" for a, b in zip(left, right, strict=True)]
+    bands = reduced.sizes["band"]
+    if len(rows) > 1:
+        z, r = (np.concatenate([part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)], axis=-3) for part in (z, r))
+        broad = z[..., :-1, :, bands]
+        together = (broad**2).mean(axis=-2)
+        z[..., -1, :, bands] = cube_root_score(together, np.full(together.shape, len(rows) / 2.0))
+        r[..., -1, :, bands] = np.sqrt((r[..., :-1, :, bands] ** 2).mean(axis=-2))
+        rows = [*rows, " ".join(axes)]
+    low, high = reduced["band_low"].values, reduced["band_high"].values
+    low = np.maximum(low, 0.5 / float(reduced.attrs["block_s"]))
+    f_min, f_max = np.append(low, low[0]), np.append(high, high[-1])
+    return view_dataset(
+        "cross_axis",
+        reduced,
+        rows=rows,
+        windows=windows,
+        columns={
+            "what": np.repeat(["in phase", "all in phase", "in quadrature", "all in quadrature"], [bands, 1, bands, 1]),
+            "tau_min_s": np.tile(0.5 / f_max, 2),
+            "tau_max_s": np.tile(0.5 / f_min, 2),
+            "frequency": np.tile(np.append(reduced["frequency"].values, np.nan), 2),
+        },
+        z=z,
+        ratio=np.abs(r),
+        estimate=r,
+    )
+
+
+def _coherency(reduced: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows) -> tuple[Complex, Array]:
+    """Coherency of each pair by (record), pair, window, band and over all bands last, and the complex ordinates in each.
+
+    Where both axes are loud in a few blocks only, these have all the weight: so many blocks of equal power would scatter as much.
+    """
+    cross = values_of(reduced, "cross", "pair", "block", "band")
+    if "cross" in baseline:
+        cross = cross - values_of(baseline, "cross", "pair", "block", "band")
+    power, shape = values_of(reduced, "power", "axis", "block", "band"), values_of(reduced, "shape", "axis", "block", "band")
+    spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flat = power / spectrum
+        cross = cross / np.sqrt(spectrum[left] * spectrum[right])
+        weight = np.minimum(shape[..., left, :, :], shape[..., right, :, :])
+    there = np.isfinite(cross) & np.isfinite(flat[..., left, :, :]) & np.isfinite(flat[..., right, :, :]) & (weight > 0)
+    weight = np.where(there, weight, 0.0)
+
+    def summed(values: Complex) -> Complex:
+        found = over_windows(np.where(there, values, 0.0) * weight, windows)
+        return np.concatenate([found, found.sum(axis=-1, keepdims=True)], axis=-1)
+
+    one, other = flat[..., left, :, :], flat[..., right, :, :]
+    product = summed(one).real * summed(other).real
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = summed(cross) / np.sqrt(product)
+        count = np.fmin(summed(np.ones_like(one)).real, product / summed(one * other).real)
+    return np.where(count >= _FEWEST, found, complex(np.nan, np.nan)), count
+
+
+def correlation_score(r: Array, samples: Array) -> Array:
+    """Normal score of a correlation of so many independent samples of known mean (Wallace 1959).
+
+    Examples
+    --------
+    >>> correlation_score(np.array([0.0, 0.1]), np.array([400.0, 400.0])).round(2)
+    array([0., 2.])
+    """
+    freedom = np.maximum(samples - 1.0, 1.0)
+    size = np.sqrt(-freedom * np.log1p(-np.minimum(r**2, 1.0 - 1e-12)))
+    return np.asarray(np.sign(r) * size * (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0))

@@ -1,0 +1,152 @@
+"""The window means, to which the Allan variance is blind, against those of the simulation."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.evidence.wandering import known_wander, mean_share
+from gyrostab.diagnose.statistics.scores import Array, Windows, over_windows, values_of, view_dataset, window_set
+from gyrostab.kernels.regression.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
+from gyrostab.kernels.regression.state_space import flicker_states
+from gyrostab.noise import HOUR
+
+__all__ = ["LENGTHS", "MeanNoise", "box_mean", "mean_noise", "precision", "score", "window_means"]
+
+#: Lengths of the windows [blocks].
+LENGTHS = (1, 5, 15, 45)
+
+
+class MeanNoise(NamedTuple):
+    """Covariance of the block means of one axis, in the form that the filters need."""
+
+    present: Array
+    innovation: Array
+    gain: Array
+    decay: Array
+    remaining: Array
+
+
+def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+    """Score the mean of windows of four lengths against the rest of the record, with the noise of the simulation.
+
+    The score is that of a constant which is added inside the window alone, by generalised least squares beside a constant
+    of the record: where the noise is white it is the window's mean less that of the rest, over its standard deviation; where it
+    wanders, the neighbours count for more.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        Recording or null records, and what the simulation expects.
+
+    Returns
+    -------
+    xarray.Dataset
+        See `gyrostab.diagnose.statistics.scores.view_dataset`; ``estimate`` is the constant [degree hour-1].
+    """
+    windows = window_set(reduced.sizes["block"], LENGTHS, whole=False)
+    amount, information = window_means(reduced, baseline, windows)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z, estimate = (amount / np.sqrt(information))[..., None], (amount / information)[..., None]
+    block = float(reduced.attrs["block_s"])
+    return view_dataset(
+        "mean",
+        reduced,
+        windows=windows,
+        columns={"what": "mean", "tau_min_s": [block], "tau_max_s": [block * max(windows.length, default=1)]},
+        z=z,
+        ratio=np.abs(z),
+        estimate=estimate,
+        units="degree hour-1",
+    )
+
+
+def window_means(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:
+    """Matched filter of every window and its information: their ratio is the constant that stands in the window alone.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        As for `score`.
+    windows : Windows
+        Not the whole record, which says nothing beside its own constant.
+
+    Returns
+    -------
+    amount, information : ndarray ((record,) axis, window), (axis, window)
+        [degree-1 hour], [degree-2 hour2]; NaN where too little of the window is there.
+    """
+    residual = values_of(reduced, "mean", "axis", "block") - values_of(baseline, "known_mean", "axis", "block")
+    amount = np.full((*residual.shape[:-1], windows.first.size), np.nan)
+    information = np.full((residual.shape[-2], windows.first.size), np.nan)
+    for axis in range(residual.shape[-2]):
+        present = np.isfinite(residual[..., axis, :]).reshape(-1, residual.shape[-1]).any(axis=0)
+        noise = mean_noise(reduced, baseline, axis, present)
+        amount[..., axis, :], information[axis] = _matched(residual[..., axis, :], noise, windows)
+    return amount, information
+
+
+def _matched(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array, Array]:
+    """Filter output and information of each window, both free from a constant."""
+    weighted = precision(residual, noise)
+    one = precision(np.ones(residual.shape[-1]), noise)
+    total = one.sum()
+    weighted = weighted - one * (weighted.sum(axis=-1, keepdims=True) / total)
+    own = np.empty(windows.first.size)
+    boxcar_information(windows.first, windows.stop, noise.innovation, noise.gain, noise.decay, noise.remaining, own)
+    across = over_windows(one[:, None], windows)[:, 0]
+    count = over_windows(noise.present[:, None], windows)[:, 0]
+    information = own - across**2 / total
+    enough = (count >= 0.25 * windows.length) & (information > 1e-3 * own)
+    return over_windows(weighted[..., None], windows)[..., 0], np.where(enough, information, np.nan)
+
+
+def mean_noise(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, present: Array) -> MeanNoise:
+    """Covariance of the block means of an axis: white, random walk and flicker of the baseline, and what else it knows to wander.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        As for `score`.
+    axis : int
+        Number of the axis.
+    present : ndarray of bool (block,)
+        Blocks whose mean is used.
+    """
+    terms = [str(term) for term in baseline["term"].values]
+    b, k = (float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)])) for term in ("B", "K"))
+    begin, end = reduced["begin"].values, reduced["end"].values
+    step = np.diff((begin + end) / 2.0, append=end[-1])
+    block, span = float(reduced.attrs["block_s"]), float(end[-1] - begin[0])
+    share, times, white = flicker_states(block, span)
+    known = known_wander(baseline, axis)
+    slow, times = np.append(b**2 * share, known.square * mean_share(block, known.time)), np.append(times, known.time)
+    decay = np.exp(-step[:, None] / times)
+    variance = baseline["mean_variance"].transpose(..., "axis", "block").values[axis] + b**2 * white
+    present = present & np.isfinite(variance) & (variance > 0)
+    n = variance.size
+    innovation, gain = np.empty(n), np.empty((n, times.size + 1))
+    remaining = np.empty((n + 1, times.size + 1, times.size + 1))
+    filter_gains(variance, present, (k**2 / HOUR + known.walk) * step, slow, decay, innovation, gain)
+    remaining_information(innovation, gain, decay, remaining)
+    return MeanNoise(present.astype(float), innovation, gain, decay, remaining)
+
+
+def precision(series: Array, noise: MeanNoise) -> Array:
+    """Inverse covariance times each series (..., block); zero at missing blocks."""
+    rows = np.ascontiguousarray(series.reshape(-1, series.shape[-1]), dtype=np.float64)
+    out = np.empty_like(rows)
+    precision_times(rows, noise.innovation, noise.gain, noise.decay, out)
+    return out.reshape(series.shape)
+
+
+def box_mean(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:
+    """Constant that stands in some blocks of a recording alone, by generalised least squares beside one of the record [degree hour-1]."""
+    residual = values_of(reduced, "mean", "axis", "block")[axis] - values_of(baseline, "known_mean", "axis", "block")[axis]
+    noise = mean_noise(reduced, baseline, axis, np.isfinite(residual))
+    rows = precision(np.stack([np.ones(residual.size), inside.astype(float)]), noise)
+    columns = np.stack([np.ones(residual.size), inside.astype(float)])
+    solved = np.linalg.lstsq(rows @ columns.T, rows @ np.nan_to_num(residual), rcond=None)[0]
+    return float(solved[1])

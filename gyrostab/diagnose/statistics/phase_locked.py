@@ -1,0 +1,117 @@
+"""What repeats with the tool's rotation or with the feedback ramp."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
+from gyrostab.diagnose.statistics.scores import (
+    Array,
+    Windows,
+    cube_root_score,
+    exponential_score,
+    over_windows,
+    values_of,
+    view_dataset,
+    window_set,
+)
+
+__all__ = ["LENGTHS", "score"]
+
+#: Lengths of the windows [blocks]; the record as a whole is one more.
+LENGTHS = (5, 15)
+
+
+def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+    """Score the harmonics that are locked to rotation, and the mean by phase of the feedback ramp.
+
+    Parameters
+    ----------
+    reduced, baseline : xarray.Dataset
+        Recording or null records, and what the simulation expects.
+
+    Returns
+    -------
+    xarray.Dataset or None
+        None with neither channel. ``estimate`` is the amplitude, or the rms over the phase [degree hour-1].
+    """
+    windows = window_set(reduced.sizes["block"], LENGTHS)
+    rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
+    found: list[tuple[Array, ...]] = []
+    what: list[str] = []
+    tau_min, tau_max = [], []
+    if "order" in reduced:
+        found.append(_orders(reduced, baseline, windows))
+        what += [f"order {h}" for h in range(1, reduced.sizes["harmonic"] + 1)]
+        turning = _turning(reduced)
+        seen = turning[turning > 0]
+        low, high = (float(seen.min()), float(seen.max())) if seen.size else (1.0 / block, rate / 2.0)
+        tau_min += [0.371 / (h * high) for h in range(1, reduced.sizes["harmonic"] + 1)]
+        tau_max += [0.371 / (h * low) for h in range(1, reduced.sizes["harmonic"] + 1)]
+    if "profile" in reduced:
+        found.append(_profile(reduced, baseline, windows))
+        what.append("ramp phase")
+        tau_min.append(1.0 / rate)
+        tau_max.append(block)
+    if not found:
+        return None
+    z, ratio, estimate = (np.concatenate(part, axis=-1) for part in zip(*found, strict=True))
+    return view_dataset(
+        "spectrum",
+        reduced,
+        windows=windows,
+        columns={"what": what, "tau_min_s": tau_min, "tau_max_s": tau_max},
+        z=z,
+        ratio=ratio,
+        estimate=estimate,
+        units="degree hour-1",
+        one_sided=True,
+    )
+
+
+def _turning(reduced: xr.Dataset) -> Array:
+    """Turns per second in each block."""
+    if "channel_rotation_rate" not in reduced:
+        return np.zeros(reduced.sizes["block"])
+    return np.asarray(np.nan_to_num(np.abs(reduced["channel_rotation_rate"].values) / 360.0))
+
+
+def _orders(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+    """Score, ratio and amplitude of the coherent sum, by (record), axis, window, harmonic."""
+    order = values_of(reduced, "order", "axis", "block", "harmonic")
+    samples = values_of(reduced, "samples", "axis", "block")
+    rate = float(reduced.attrs["sampling_rate_hz"])
+    turning, spectrum = _turning(reduced), baseline["spectrum"].transpose("axis", "block", "band").values
+    bands = np.log(baseline["frequency"].values)
+    at = np.log(np.clip(turning[:, None] * np.arange(1, order.shape[-1] + 1), np.exp(bands[0]), np.exp(bands[-1])))
+    density = np.empty((*spectrum.shape[:2], order.shape[-1]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis, block in np.ndindex(spectrum.shape[:2]):
+            density[axis, block] = np.exp(np.interp(at[block], bands, np.log(spectrum[axis, block])))
+        density = noise_at_orders(reduced, density)
+        variance = 4.0 * density * rate / samples[..., None]  # of |order|^2 / 1: two components of 2 S rate / n each
+        there = np.isfinite(order) & np.isfinite(variance) & (variance > 0) & (turning > 0.5 / float(reduced.attrs["block_s"]))[:, None]
+        weight = np.where(there, 1.0 / variance, 0.0)
+        sums = over_windows(np.where(there, order, 0.0) * weight, windows)
+        total = over_windows(weight, windows)
+        ratio = np.where(total > 0, np.abs(sums) ** 2 / total, np.nan)
+        amplitude = np.abs(sums) / total
+    return exponential_score(ratio), ratio, amplitude
+
+
+def _profile(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+    """Score, ratio and rms of the mean by phase, by (record), axis, window, one."""
+    profile = values_of(reduced, "profile", "axis", "block", "phase")
+    samples = values_of(reduced, "profile_samples", "axis", "block", "phase")
+    width = (reduced["band_high"] - reduced["band_low"]).values
+    variance = 2.0 * (baseline["spectrum"].transpose("axis", "block", "band").values * width).sum(axis=-1)[..., None]
+    there = np.isfinite(profile) & (samples > 0) & np.isfinite(variance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(there, samples / variance, 0.0)
+        sums, total = over_windows(np.where(there, profile, 0.0) * weight, windows), over_windows(weight, windows)
+        used = (total > 0).sum(axis=-1, keepdims=True)
+        square = np.where(total > 0, sums**2 / total, 0.0).sum(axis=-1, keepdims=True)
+        ratio = np.where(used > 1, square / used, np.nan)
+        excess = np.maximum(square - used, 0.0) / total.sum(axis=-1, keepdims=True)
+    return cube_root_score(ratio, np.where(used > 1, used / 2.0, np.nan)), ratio, np.sqrt(excess)

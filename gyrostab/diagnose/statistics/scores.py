@@ -1,0 +1,176 @@
+"""What the views share: windows of blocks, sums over them, near-normal scores, and the Dataset of a view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.special import ndtri_exp
+
+__all__ = ["Array", "Windows", "cube_root_score", "exponential_score", "over_windows", "values_of", "view_dataset", "window_set"]
+
+Array = NDArray[np.float64]
+#: A window moves by this share of its length, in records up to so many blocks, and in longer ones.
+_STEP, _LONG, _LONG_STEP = 0.2, 1000, 0.4
+
+
+class Windows(NamedTuple):
+    """Windows of whole blocks: the first block of each, and the first behind it."""
+
+    first: NDArray[np.int64]
+    stop: NDArray[np.int64]
+
+    @property
+    def length(self) -> NDArray[np.int64]:
+        """Blocks of each window."""
+        return self.stop - self.first
+
+
+def window_set(blocks: int, lengths: Sequence[int], *, whole: bool = True) -> Windows:
+    """Windows of several lengths over a record, a fifth of their length apart (two fifths in long records).
+
+    Parameters
+    ----------
+    blocks : int
+        Blocks of the record.
+    lengths : sequence of int
+        Lengths [blocks]; those above half of the record are left out.
+    whole : bool
+        Add the record as one window.
+
+    Examples
+    --------
+    >>> found = window_set(10, (1, 5))
+    >>> found.length.tolist()
+    [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 5, 5, 5, 5, 5, 5, 10]
+    """
+    first, length = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for wanted in lengths:
+        if wanted > max(blocks // 2, 1):
+            continue
+        step = max(1, round(wanted * (_STEP if blocks <= _LONG else _LONG_STEP)))
+        start = np.arange(0, blocks - wanted + 1, step)
+        if start[-1] != blocks - wanted:
+            start = np.append(start, blocks - wanted)
+        first.append(start)
+        length.append(np.full(start.size, wanted))
+    if whole:
+        first.append(np.zeros(1, np.int64))
+        length.append(np.full(1, blocks))
+    begin = np.concatenate(first)
+    return Windows(begin, begin + np.concatenate(length))
+
+
+def over_windows(values: Any, windows: Windows) -> Any:
+    """Sums over each window; the blocks are the last dimension but one, missing values must be zero.
+
+    Examples
+    --------
+    >>> over_windows(np.ones((4, 1)), window_set(4, (2,), whole=False))[:, 0]
+    array([2., 2., 2.])
+    """
+    total = np.zeros((*values.shape[:-2], values.shape[-2] + 1, values.shape[-1]), dtype=values.dtype)
+    np.cumsum(values, axis=-2, out=total[..., 1:, :])
+    return total[..., windows.stop, :] - total[..., windows.first, :]
+
+
+def cube_root_score(ratio: Array, shape: Array) -> Array:
+    """Near-normal score of a gamma-distributed ratio of mean 1 (Wilson and Hilferty 1931); NaN where `shape` is not positive.
+
+    Examples
+    --------
+    >>> float(cube_root_score(np.array(1.0 + 2.0 / 100.0), np.array(1e4)).round(2))  # two standard deviations above
+    1.99
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        third = 1.0 / (9.0 * shape)
+        return np.asarray((np.cbrt(np.maximum(ratio, 0.0)) - (1.0 - third)) / np.sqrt(third))
+
+
+def exponential_score(value: Array) -> Array:
+    """Normal score of a value that is exponentially distributed with mean 1.
+
+    Examples
+    --------
+    >>> float(exponential_score(np.array(np.log(2.0))).round(6)) + 0.0
+    0.0
+    """
+    return np.asarray(-ndtri_exp(-value))
+
+
+def values_of(reduced: xr.Dataset, name: str, *dims: str) -> Any:
+    """Values of a variable, `dims` last; a leading dimension of records stays in front."""
+    return reduced[name].transpose(..., *dims).values
+
+
+def view_dataset(
+    name: str,
+    reduced: xr.Dataset,
+    *,
+    windows: Windows,
+    columns: dict[str, Any],
+    z: Array,
+    ratio: Array,
+    rows: Sequence[str] | None = None,
+    estimate: Array | None = None,
+    units: str = "1",
+    one_sided: bool = False,
+) -> xr.Dataset:
+    """The cells of a view, all views alike.
+
+    Parameters
+    ----------
+    name : str
+        View, one of the contract's.
+    reduced : xarray.Dataset
+        Of `gyrostab.diagnose.reduce.block_statistics.reduce_log`; gives the edges of the windows.
+    windows : Windows
+        The windows.
+    columns : dict
+        ``what`` (str), ``tau_min_s``, ``tau_max_s`` [s] and ``frequency`` [Hz] of each column, and ``floor``, the smallest standard
+        deviation that null records may give to a score.
+    z, ratio : ndarray (..., row, window, tau)
+        Near-normal score; observed over expected.
+    rows : sequence of str, optional
+        Axes of each row, those of one row parted by a blank; by default a row is an axis of the record.
+    estimate : ndarray, optional
+        The mismatch as a number of `units`.
+    units : str
+        Of the estimate.
+    one_sided : bool
+        Only what lies above the expected is a mismatch.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``z``, ``ratio`` and ``estimate`` by (record), row, window, tau.
+    """
+    dims = ("record", "row", "window", "tau") if z.ndim == 4 else ("row", "window", "tau")
+    begin, end = reduced["begin"].values, reduced["end"].values
+    size = z.shape[-1]
+    label = {key: np.broadcast_to(np.asarray(value), size) for key, value in columns.items()}
+    found = xr.Dataset(
+        {
+            "z": (dims, z, {"units": "1", "long_name": "score, near-normal where recording and simulation agree"}),
+            "ratio": (dims, ratio, {"units": "1", "long_name": "observed over expected"}),
+        },
+        coords={
+            "axes": ("row", np.asarray(reduced["axis"].values if rows is None else rows, dtype=str)),
+            "begin": ("window", begin[windows.first], {"units": "s"}),
+            "end": ("window", end[windows.stop - 1], {"units": "s"}),
+            "first": ("window", windows.first),
+            "stop": ("window", windows.stop),
+            "what": ("tau", label["what"]),
+            "tau_min_s": ("tau", label["tau_min_s"], {"units": "s"}),
+            "tau_max_s": ("tau", label["tau_max_s"], {"units": "s"}),
+            "frequency": ("tau", label.get("frequency", np.full(size, np.nan)), {"units": "Hz"}),
+            "floor": ("tau", label.get("floor", np.full(size, 0.2))),
+        },
+        attrs={"view": name, "one_sided": int(one_sided)},
+    )
+    if estimate is not None:
+        found["estimate"] = (dims, np.broadcast_to(estimate, z.shape), {"units": units})
+    return found
