@@ -66,7 +66,7 @@ interop: $(VENV)/.installed-test  ## open the files in other programs, those tha
 	$(BIN)/python -m pytest -n0 -v tests/interop
 
 baseline: $(VENV)/.installed-test  ## remake the pictures that the figures are compared with; look at them afterwards
-	$(BIN)/python -m tests.test_figures
+	$(BIN)/python -m tests.plot.test_figures
 
 clean-kernels:  ## forget the compiled kernels
 	find gyrostab -name '*.nb[ic]' -delete

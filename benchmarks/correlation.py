@@ -3,7 +3,7 @@
     python benchmarks/correlation.py --records 400 --output docs/temperature.md
 
 False claims, coverage of the intervals, and power beside an oracle that knows the noise; all on simulated records
-(tests/coupled.py) whose seeds count from `SEED`, so that the same command makes the same tables.
+(tests/support/coupled.py) whose seeds count from `SEED`, so that the same command makes the same tables.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from page import renew
 
 import gyrostab
 from gyrostab.correlate.judge import VERDICTS
-from tests import coupled
+from tests.support import coupled
 
 SEED = 100_000
 NAMES = {"white": "white", "flicker": "white + flicker", "walk": "white + random walk", "slow": "white + slow autoregression"}

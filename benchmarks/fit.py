@@ -24,7 +24,7 @@ from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import fit
 from gyrostab.kernels.fit.covariance import diagonal_products
 from gyrostab.kernels.fit.least_squares import fit_windows, identify_noise
-from tests.noise_records import lose, quantization, random_walk, white
+from tests.support.noise_records import lose, quantization, random_walk, white
 
 RATE, SAMPLES = 400.0, 6_000_000
 

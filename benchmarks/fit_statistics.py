@@ -2,7 +2,7 @@
 
     python benchmarks/fit_statistics.py --output docs/statistics.md      # about five minutes
 
-Each row is 1000 independent windows of 40 s at 100 Hz, simulated outside the package (tests/noise_records.py).
+Each row is 1000 independent windows of 40 s at 100 Hz, simulated outside the package (tests/support/noise_records.py).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from page import renew
 
 from gyrostab import confidence_interval, davar, fit_noise, make_log
 from gyrostab.noise import TERMS, model_avar
-from tests.noise_records import flicker, lose, quantization, random_walk, white
+from tests.support.noise_records import flicker, lose, quantization, random_walk, white
 
 RATE, SAMPLES, TRIALS = 100.0, 4000, 1000
 MIXTURES: dict[str, dict[str, float]] = {

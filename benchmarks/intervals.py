@@ -25,7 +25,7 @@ from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Part, explain_away
 from gyrostab.diagnose.predict.linear_model import begin_state
-from tests.named import COEFFICIENT, record
+from tests.support.named import COEFFICIENT, record
 
 
 def frames(reduced, baseline, effect, view, column):

@@ -11,8 +11,8 @@ import sys
 import numpy as np
 
 from gyrostab.ingest.grid.regularise import regularise
-from tests.raw_rows import raw_log
-from tests.stamp_scatter import JITTER, LOSSES, UNITS, lose_samples, round_stamps, scatter_stamps
+from tests.support.raw_rows import raw_log
+from tests.support.stamp_scatter import JITTER, LOSSES, UNITS, lose_samples, round_stamps, scatter_stamps
 
 SCATTERS = (0.1, 0.3, 0.6)
 RATE = 99.7

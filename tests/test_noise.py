@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from gyrostab.allan.davar import davar
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import LAWS, TERMS, URAD_PER_S, avar_columns, model_avar, sample_squares
-from tests.noise_records import flicker, quantization, random_walk, white
+from tests.support.noise_records import flicker, quantization, random_walk, white
 
 HOUR = 3600.0
 

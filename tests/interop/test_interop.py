@@ -16,7 +16,7 @@ import xarray as xr
 
 from gyrostab.correlate import correlate, join
 from gyrostab.io.datasets import to_netcdf, to_zarr
-from tests import synthetic
+from tests.support import synthetic
 
 HERE = Path(__file__).parent
 DEGREES_AND_HOURS = {

@@ -1,0 +1,527 @@
+"""Confidence intervals and fitted coefficients against simulated truth; the statistics are claims and checked as such."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import dask.array as da
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from gyrostab.allan import fit
+from gyrostab.allan.confidence import confidence_interval
+from gyrostab.allan.davar import davar
+from gyrostab.allan.fit import fit_noise
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.ingest.make_log import make_log
+from gyrostab.kernels.allan.pairs import white_pair_sum
+from gyrostab.kernels.fit.covariance import product_tables
+from gyrostab.kernels.fit.least_squares import FIT_FIELDS, fit_windows
+from gyrostab.kernels.fit.limits import cell_limits, interpolate_quantile
+from gyrostab.kernels.regression.nonnegative import solve_nonnegative
+from gyrostab.noise import LAWS, TERMS, model_avar
+from gyrostab.schema import OBSERVABLE
+from tests.reference import fit_window_plainly
+from tests.support.noise_records import flicker, lose, quantization, random_walk, white
+
+RATE = 100.0
+
+
+def windows_of(x, **options):
+    """Surface of independent trials, one window each, laid end to end on one axis."""
+    n = x.shape[1]
+    return davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=f"{n}samples", step=f"{n}samples", **options)
+
+
+def records(kind, rng, trials, n):
+    if kind == "white":
+        return white(rng, trials, n, N=0.01, rate=RATE), {"N": 0.01}
+    if kind == "flicker":
+        return flicker(rng, trials, n, B=1.0), {"B": 1.0}
+    return random_walk(rng, trials, n, K=20.0, rate=RATE), {"K": 20.0}
+
+
+@pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.1, 5)])
+@pytest.mark.parametrize("kind", ["white", "flicker", "random walk"])
+def test_95_percent_intervals_hold_the_truth(kind, share, block):
+    """2000 trials at every averaging time; the share of hits has a binomial sd of 0.5 %, and nine taus are looked at."""
+    rng = np.random.default_rng([1, len(kind), block])
+    x, law = records(kind, rng, 2000, 700)
+    surface = windows_of(lose(rng, x, share, block), taus="octave").isel(axis=0)
+    truth = model_avar(surface.tau, law) * (surface.white_response if kind == "white" else 1.0)
+    whole = surface.expand_dims("axis").transpose("axis", "time", "tau", "bnds")
+    for product in (whole, fit_noise(whole)):
+        limits = confidence_interval(product).isel(axis=0)
+        here = limits.avar_lower.notnull()
+        assert here.mean() > 0.99
+        hit = ((limits.avar_lower <= truth) & (truth <= limits.avar_upper)).where(here).mean("time")
+        assert 0.93 <= float(hit.mean()) <= 0.97
+        assert float(hit.min()) >= 0.92
+        assert float(hit.max()) <= 0.98
+
+
+def test_intervals_hold_where_tiny_gaps_raise_quantization_noise():
+    rng = np.random.default_rng(18)
+    x = white(rng, 1500, 2000, N=0.01, rate=RATE) + quantization(rng, 1500, 2000, Q=0.4, rate=RATE)
+    product = fit_noise(windows_of(lose(rng, x, 0.2, 5), taus=16))
+    assert float(product.quantization_response.max()) > 30
+    truth = product.white_response * model_avar(product.tau, {"N": 0.01})
+    truth = truth + product.quantization_response * model_avar(product.tau, {"Q": 0.4})
+    limits = confidence_interval(product)
+    hit = ((limits.avar_lower <= truth) & (truth <= limits.avar_upper)).mean(("axis", "time"))
+    assert float(hit.min()) > 0.925
+    assert float(hit.max()) < 0.99
+
+
+def test_degrees_of_freedom_are_those_of_greenhall():
+    """allantools computes the same published tables by a different route; its white-noise case is approximate at short tau."""
+    from allantools.ci import edf_greenhall
+
+    window = 1000
+    for alpha, term in ((0, 1), (-1, 2), (-2, 3)):
+        for k in (20, 100, 333):
+            ks = np.array([k])
+            product = product_tables(window, ks, np.zeros(1, dtype=np.int64))[0][term, term, 0, 0]
+            mean = {1: 1 / k, 2: 2 * np.log(2) / np.pi, 3: k / 3}[term]
+            expected = edf_greenhall(alpha, 2, k, window + 1, overlapping=True, modified=False)
+            assert 2 * mean**2 / product == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize("k", [1, 2, 7, 40])
+def test_closed_form_of_the_white_pair_sum(k):
+    """Against the sum itself, the correlation taken from the weights of the second difference."""
+    weights = np.concatenate([-np.ones(k), np.ones(k)])
+    correlation = np.correlate(weights, weights, "full")[2 * k - 1 :] / (2 * k)
+    for n in (1, 2, k, 2 * k, 100):
+        rho = np.zeros(n)
+        rho[: min(n, 2 * k)] = correlation[: min(n, 2 * k)]
+        lags = np.arange(1, n)
+        assert white_pair_sum(n, k) == pytest.approx(n + 2 * np.sum((n - lags) * rho[1:] ** 2), rel=1e-10)
+
+
+def test_covariance_between_averaging_times_is_that_of_simulated_noise():
+    rng = np.random.default_rng(3)
+    ks = np.array([1, 2, 5, 20, 100])
+    x = (
+        white(rng, 4000, 600, N=0.01, rate=RATE)
+        + random_walk(rng, 4000, 600, K=30.0, rate=RATE)
+        + quantization(rng, 4000, 600, Q=0.2, rate=RATE)
+    )
+    avar = windows_of(x, taus=list(ks / RATE)).avar.values[0]
+    from gyrostab.noise import sample_squares
+
+    squares = np.array([0.2, 0.01, 0.0, 30.0]) ** 2 * sample_squares(RATE)[:4]
+    predicted = np.einsum("a,b,abij->ij", squares, squares, product_tables(600, ks, np.zeros_like(ks))[0])
+    scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
+    np.testing.assert_allclose(np.cov(avar.T) / scale, predicted / scale, atol=0.12)
+
+
+@pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])
+def test_standard_errors_are_right(share, block):
+    """z-scores of repeated simulations have a standard deviation of 0.9 to 1.1, also through gaps."""
+    rng = np.random.default_rng([4, block])
+    truth = {"Q": 0.3, "N": 0.01, "K": 400.0}
+    x = white(rng, 1000, 3000, N=truth["N"], rate=RATE) + quantization(rng, 1000, 3000, Q=truth["Q"], rate=RATE)
+    x += random_walk(rng, 1000, 3000, K=truth["K"], rate=RATE)
+    surface = windows_of(lose(rng, x, share, block), taus=24)
+    product = fit_noise(surface)
+    for term, value in truth.items():
+        z = (product[term] - value) / product[f"{term}_stderr"]
+        assert 0.9 <= float(z.std()) <= 1.1, term
+    assert 0.7 < float((product.fit_chi2 / product.fit_dof).mean()) < 1.2
+    # B cannot be negative and takes a little from its neighbours; without it they are unbiased
+    for term, value in truth.items():
+        assert float(fit_noise(surface, terms="QNK")[term].mean()) == pytest.approx(value, rel=0.03), term
+
+
+def test_flicker_alone_gives_b():
+    rng = np.random.default_rng(5)
+    product = fit_noise(windows_of(flicker(rng, 600, 2000, B=0.5), taus=20))
+    z = (product.B - 0.5) / product.B_stderr
+    assert 0.88 <= float(z.std()) <= 1.12
+    assert float(product.B.mean()) == pytest.approx(0.5, rel=0.03)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_what_is_not_there_is_rarely_claimed_and_its_limit_holds(share):
+    """White noise only: each absent term is called observed in about 1 % of windows; limits cover a small truth."""
+    rng = np.random.default_rng([6, int(share * 10)])
+    product = fit_noise(windows_of(lose(rng, white(rng, 2000, 2000, N=0.01, rate=RATE), share, 20), taus=20))
+    for term in "QBKR":
+        assert float((product.observable.sel(term=term) == OBSERVABLE.index("observed")).mean()) <= 0.025
+    described = fit.is_described(product.fit_chi2, product.fit_dof)
+    assert described.mean() > 0.98
+    np.testing.assert_array_equal(product.observable.sel(term="N") == OBSERVABLE.index("observed"), described)
+    rng = np.random.default_rng([7, int(share * 10)])
+    x = white(rng, 1000, 2000, N=0.01, rate=RATE) + flicker(rng, 1000, 2000, B=0.4)
+    product = fit_noise(windows_of(lose(rng, x, share, 20), taus=20))
+    limited = product.observable.sel(term="B") == OBSERVABLE.index("upper_limit_only")
+    assert limited.sum() > 300
+    assert float((product.B_upper >= 0.4).where(limited).mean()) >= 0.95
+
+
+def folded(rng, trials, n, *, N):
+    """White noise of N up to a quarter of the sampling rate and none above, as an alias or a filter leaves it."""
+    spectrum = np.fft.rfft(white(rng, trials, n, N=N, rate=RATE))
+    spectrum[:, np.fft.rfftfreq(n) > 0.25] = 0.0
+    return np.fft.irfft(spectrum, n)
+
+
+def test_limits_hold_where_the_five_terms_do_not_fit():
+    """Noise that is white below half of the band only: the five terms call it B, and from the fit alone N would be excluded."""
+    rng = np.random.default_rng(21)
+    product = fit_noise(windows_of(folded(rng, 600, 2000, N=0.01), taus=30))
+    assert float((product.fit_chi2 / product.fit_dof).median()) > 10
+    limited = product.observable == OBSERVABLE.index("upper_limit_only")
+    assert (limited.mean(("axis", "time")) > 0.99).all()
+    assert float((product.N_upper >= 0.01).where(limited.sel(term="N"), True).mean()) >= 0.94
+    assert float(product.N_upper.median()) < 0.02
+
+
+def test_what_is_added_to_the_noise_leaves_the_limits_high_enough():
+    """A tone in the middle of the averaging times: no term that is there may be excluded, seen or not."""
+    rng = np.random.default_rng(22)
+    t = np.arange(2000) / RATE
+    tone = 60.0 * np.sin(2 * np.pi * 1.3 * t + rng.uniform(0, 2 * np.pi, (600, 1)))
+    product = fit_noise(windows_of(white(rng, 600, 2000, N=0.01, rate=RATE) + flicker(rng, 600, 2000, B=0.4) + tone, taus=30))
+    assert (product.fit_chi2 > 2 * product.fit_dof).mean() > 0.95
+    for term, value in (("N", 0.01), ("B", 0.4)):
+        limited = product.observable.sel(term=term) == OBSERVABLE.index("upper_limit_only")
+        assert limited.sum() > 100
+        assert float((product[f"{term}_upper"] >= value).where(limited).mean()) >= 0.95, term
+
+
+def test_no_term_is_observed_where_the_five_terms_do_not_describe_the_window():
+    """A tone of 60 deg/h on white noise: N and B are fitted with small errors, to a curve that is not theirs."""
+    rng = np.random.default_rng(24)
+    t = np.arange(2000) / RATE
+    tone = 60.0 * np.sin(2 * np.pi * 1.3 * t + rng.uniform(0, 2 * np.pi, (100, 1)))
+    surface = windows_of(white(rng, 100, 2000, N=0.01, rate=RATE) + tone, taus=30)
+    product = fit_noise(surface)
+    assert not fit.is_described(product.fit_chi2, product.fit_dof).any()
+    assert (product.observable != OBSERVABLE.index("observed")).all()
+    assert float((product.N_upper >= 0.01).mean()) >= 0.95
+    for term in TERMS:
+        assert product[term].isnull().all(), term
+        assert product[f"{term}_stderr"].isnull().all(), term
+    estimates = fit_noise(surface, observed_only=False)
+    assert estimates.N.notnull().all()
+    xr.testing.assert_equal(estimates.observable, product.observable)
+
+
+def test_a_coefficient_and_its_error_are_missing_where_the_term_is_not_observed():
+    product = fit_noise(windows_of(white(np.random.default_rng(25), 50, 2000, N=0.01, rate=RATE), taus=20))
+    for term in TERMS:
+        seen = product.observable.sel(term=term) == OBSERVABLE.index("observed")
+        np.testing.assert_array_equal(product[term].notnull(), seen, err_msg=term)
+        np.testing.assert_array_equal(product[f"{term}_stderr"].notnull(), seen, err_msg=term)
+        assert product[f"{term}_upper"].where(seen).isnull().all(), term
+    assert (product.observable == OBSERVABLE.index("upper_limit_only")).any()
+
+
+def test_errors_widen_with_the_misfit_and_only_then():
+    rng = np.random.default_rng(23)
+    surface = windows_of(white(rng, 40, 2000, N=0.01, rate=RATE), taus=20)
+    spoiled = surface.assign(avar=surface.avar * (1 + 0.2 * (np.arange(surface.sizes["tau"]) % 2)))
+    for cells, fits in ((surface, True), (spoiled, False)):
+        product = fit_noise(cells, terms="N", observed_only=False)
+        flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in fit._inputs(cells)[0]]
+        ks = np.round(cells.tau.values * RATE).astype(np.int64)
+        tables = fit._tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2000)
+        result, misfit, _ = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 2)
+        fails = chi2.sf(misfit[:, 0], misfit[:, 1]) < 1e-3
+        assert fails.mean() < 0.06 if fits else fails.all()
+        scale = np.where(fails, np.sqrt(misfit[:, 0] / misfit[:, 1]), 1.0)
+        expected = result[:, FIT_FIELDS.index("square_stderr"), 1] * scale / (2 * np.sqrt(result[:, 0, 1]))
+        np.testing.assert_allclose(product.N_stderr[0], expected, rtol=1e-9)
+
+
+def test_a_pure_ramp_is_r():
+    t = np.arange(20_000) / RATE / 3600
+    x = 36.0 * t + 1e-3 * np.random.default_rng(8).standard_normal(20_000)
+    product = fit_noise(davar(make_log(x, rate=RATE, unit="deg/h"), window="5000samples"), observed_only=False)
+    np.testing.assert_allclose(product.R, 36.0, rtol=2e-3)
+
+
+def test_gap_aware_columns_remove_the_bias_that_nominal_columns_have():
+    """20 % missing in blocks of five: nominal columns read N a quarter high, the columns of the mask do not."""
+    rng = np.random.default_rng(9)
+    x = lose(rng, white(rng, 40, 20_000, N=0.01, rate=RATE), 0.2, 5)
+    surface = windows_of(x, taus=24, min_strict=1.0)  # cluster means throughout
+    aware = fit_noise(surface, terms="QN")
+    ones = xr.ones_like(surface.white_response)
+    nominal = fit_noise(surface.assign(white_response=ones, quantization_response=ones), terms="N")
+    assert float(aware.N.mean()) == pytest.approx(0.01, rel=0.005)
+    assert float(nominal.N.mean()) > 0.0101
+
+
+def test_the_fit_of_deviations_of_the_2015_paper_is_not_additive():
+    """P15 adds deviations where variances add: with N and K together it misses both, the fit of variances neither."""
+    tau = np.geomspace(0.01, 1000, 30)
+    truth = {"N": 0.01, "K": 5.0}
+    surface = windows_of(np.zeros((2, 300_000)), taus=list(np.round(tau, 2)))
+    surface["avar"] = xr.zeros_like(surface.avar) + model_avar(surface.tau, truth)
+    good, paper = fit_noise(surface), fit_noise(surface, method="adev")
+    for term, value in truth.items():
+        assert float(good[term][0, 0]) == pytest.approx(value, rel=1e-3)
+    assert abs(float(paper["K"][0, 0]) / truth["K"] - 1) > 0.03
+
+
+def test_averaging_times_below_a_disturbance_can_be_left_out():
+    """A tone at 5 Hz spoils tau below a second and with it N; from 2 s on the noise is as it was."""
+    t = np.arange(300_000) / RATE
+    x = white(np.random.default_rng(17), 1, t.size, N=0.01, rate=RATE)[0] + 40 * np.sin(2 * np.pi * 5.013 * t)
+    surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="100000samples", step="100000samples")
+    spoiled, clean = (fit_noise(surface, tau_min=shortest, observed_only=False) for shortest in (None, "5s"))
+    assert abs(float(clean.N.mean()) / 0.01 - 1) < 0.2
+    assert abs(float(spoiled.N.mean()) / 0.01 - 1) > 0.5
+    with pytest.raises(OptionError, match="no averaging time"):
+        fit_noise(surface, tau_min="2h")
+
+
+def test_window_without_data_is_said_to_see_nothing():
+    x = np.random.default_rng(10).standard_normal((3, 1000))
+    x[1] = np.nan
+    product = fit_noise(windows_of(x))
+    assert (product.observable[0, 1] == OBSERVABLE.index("not_observable")).all()
+    assert product.N.isnull().values.tolist() == [[False, True, False]]
+
+
+def test_two_averaging_times_cannot_tell_five_terms_apart():
+    product = fit_noise(windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01, 0.1]))
+    assert (product.observable == OBSERVABLE.index("not_observable")).any()
+    chosen = fit_noise(windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01, 0.1]), terms="N")
+    assert (chosen.observable.sel(term="N") == OBSERVABLE.index("observed")).all()
+    assert (chosen.observable.sel(term="Q") == OBSERVABLE.index("not_observable")).all()
+
+
+def test_a_lazy_surface_stays_lazy_and_fits_the_same():
+    x = np.random.default_rng(12).standard_normal((2, 20_000))
+    log = make_log(x, rate=RATE, unit="deg/h")
+    eager = fit_noise(davar(log, window="2000samples", step="500samples"))
+    lazy = fit_noise(davar(log.chunk(time=7000), window="2000samples", step="500samples"))
+    assert isinstance(lazy.N.data, da.Array)
+    for name in (*TERMS, "N_stderr", "K_upper", "observable", "fit_chi2", "edf"):
+        np.testing.assert_array_equal(lazy[name].values, eager[name].values)
+
+
+def test_many_averaging_times_are_thinned_for_the_fit():
+    surface = davar(make_log(np.random.default_rng(13).standard_normal(6000), rate=RATE, unit="deg/h"), window="3000samples", taus="all")
+    product = fit_noise(surface)
+    assert product.sizes["tau"] == 1000
+    assert product.edf.notnull().all()
+    assert float(product.N.mean()) == pytest.approx(1 / 600, rel=0.05)
+
+
+def test_nonnegative_solution_beats_every_other_point():
+    """The exact solution against many random feasible points, and against scipy."""
+    from scipy.optimize import nnls
+
+    rng = np.random.default_rng(14)
+    for _ in range(50):
+        design = rng.standard_normal((12, 5)) * 10.0 ** rng.integers(-6, 6, 5)
+        data = rng.standard_normal(12)
+        solution = np.empty(5)
+        solve_nonnegative(design.T @ design, design.T @ data, 31, solution, 0)
+        expected, residual = nnls(design, data)
+        assert np.linalg.norm(design @ solution - data) <= residual * (1 + 1e-6)
+        np.testing.assert_allclose(design @ solution, design @ expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])
+@pytest.mark.parametrize("law", [{"N": 0.01}, {"Q": 0.4, "N": 0.01, "K": 200.0}, {"N": 0.01, "K": 40.0, "R": 3000.0}], ids="+".join)
+def test_fast_fit_is_the_plain_fit(law, share, block):
+    """Against numpy and scipy, one window at a time; every number that errors and limits are made of."""
+    rng = np.random.default_rng([19, block])
+    x = white(rng, 12, 3000, N=law["N"], rate=RATE) + random_walk(rng, 12, 3000, K=law.get("K", 0.0), rate=RATE)
+    x += quantization(rng, 12, 3000, Q=law.get("Q", 0.0), rate=RATE) + law.get("R", 0.0) * np.arange(3000) / RATE / 3600
+    cells, ks, rate, window = fit._inputs(windows_of(lose(rng, x, share, block), taus=21))
+    flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells]
+    flat[0][3, 5] = np.nan
+    tables = fit._tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
+    result, misfit, _ = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 31)
+    for w in range(12):
+        plain = fit_window_plainly(*(cell[w] for cell in flat), tables)
+        assert misfit[w, 0] == pytest.approx(float(plain.pop("chi2")), rel=1e-5)
+        there = plain["square"] > 2.3 * plain["square_stderr"]
+        for row, name in enumerate(FIT_FIELDS[:-1]):
+            np.testing.assert_allclose(result[w, row, there], plain[name][there], rtol=1e-6, atol=1e-12 * abs(plain[name]).max())
+            np.testing.assert_allclose(result[w, row], plain[name], rtol=1e-4, atol=1e-7 * abs(plain[name]).max())
+
+
+def cells_of(x, **options):
+    """Arguments of `fit_windows` for independent windows, and the tables of `gyrostab.allan.fit`."""
+    cells, ks, rate, window = fit._inputs(windows_of(x, **options))
+    return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._tables(
+        tuple(ks.tolist()), (0,) * ks.size, rate, window
+    )
+
+
+def shared(tables, **changed):
+    names = ("columns", "to_samples", "pairs", "ramps", "weight")
+    return [changed.get(name, getattr(tables, name)) for name in names]
+
+
+def mixed_records(rng, trials):
+    """Every window another noise, so that fits side by side differ in their terms and in when they arrive."""
+    x = white(rng, trials, 3000, N=0.01, rate=RATE) * rng.choice([0.1, 1.0, 3.0], (trials, 1))
+    x += random_walk(rng, trials, 3000, K=400.0, rate=RATE) * rng.choice([0.0, 1.0], (trials, 1))
+    x += quantization(rng, trials, 3000, Q=0.4, rate=RATE) * rng.choice([0.0, 1.0], (trials, 1))
+    return x + rng.choice([0.0, 3000.0], (trials, 1)) * np.arange(3000) / RATE / 3600
+
+
+def test_a_window_has_the_same_fit_in_any_place_beside_any_other():
+    """Bit for bit: among others in another order, beside windows without cells, and beside ones whose numbers overflow."""
+    rng = np.random.default_rng(32)
+    flat, tables = cells_of(lose(rng, mixed_records(rng, 21), 0.2, 20), taus=21)
+    expected = fit_windows(*flat, *shared(tables), 31)
+    order = rng.permutation(21)
+    for got, want in zip(fit_windows(*[cell[order] for cell in flat], *shared(tables), 31), expected, strict=True):
+        np.testing.assert_array_equal(got, want[order])
+    spoiled = [cell.copy() for cell in flat]
+    spoiled[0][3::8] = np.nan
+    spoiled[0][5::8] *= 1e200
+    spoiled[0][6::8] *= 1e-200
+    left = np.flatnonzero(~np.isin(np.arange(21) % 8, (3, 5, 6)))
+    result, misfit, dof = fit_windows(*spoiled, *shared(tables), 31)
+    for got, want in zip((result, misfit, dof), expected, strict=True):
+        np.testing.assert_array_equal(got[left], want[left])
+    assert np.isnan(np.delete(result, left, axis=0)[:, 0]).all()
+    assert (misfit[6::8, 1] == 0).all()
+
+
+def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_must_be():
+    """Tables that are wrong by 2e-5 for random walks and right for all else; the plain fit widens window by window."""
+    rng = np.random.default_rng(33)
+    walks = random_walk(rng, 20, 3000, K=400.0, rate=RATE)
+    flat, tables = cells_of(np.where(np.arange(20)[:, None] % 3 == 1, walks, mixed_records(rng, 20)), taus=21)
+    pairs = tables.pairs.copy()
+    values, vectors = np.linalg.eigh(pairs[3, 3] / np.sqrt(np.outer(np.diag(pairs[3, 3]), np.diag(pairs[3, 3]))))
+    scale = np.sqrt(np.diag(pairs[3, 3]))
+    pairs[3, 3] -= (values[0] + 2e-5) * np.outer(vectors[:, 0] * scale, vectors[:, 0] * scale)
+    damaged = SimpleNamespace(**{**vars(tables), "pairs": pairs})
+    result, misfit, _ = fit_windows(*flat, *shared(tables, pairs=pairs), 31)
+    widened = 0
+    for w in range(20):
+        plain = fit_window_plainly(*(cell[w] for cell in flat), damaged)
+        assert misfit[w, 0] == pytest.approx(float(plain["chi2"]), rel=1e-4)
+        np.testing.assert_allclose(result[w, 0], plain["square"], rtol=1e-4, atol=1e-7 * abs(plain["square"]).max())
+        widened += plain["jitter"] > 1e-6
+    assert 2 < widened < 18
+
+
+def test_windows_are_fitted_alike_alone_and_together():
+    x = np.random.default_rng(20).standard_normal((9, 2000))
+    surface = windows_of(x, taus=21)
+    together = fit_noise(surface)
+    for w in (0, 4, 8):
+        alone = fit_noise(surface.isel(time=[w]))
+        for name in (*TERMS, "N_stderr", "K_upper", "fit_chi2", "edf"):
+            np.testing.assert_array_equal(alone[name].values[:, 0], together[name].values[:, w])
+
+
+@pytest.fixture(scope="module")
+def quantile_curve():
+    return fit._quantile_curve(0.05)
+
+
+@settings(deadline=None)
+@given(st.floats(-4.0, 12.3))
+def test_interpolated_quantile_is_that_of_scipy(quantile_curve, exponent):
+    freedom = np.array([10.0**exponent])
+    expected = chi2.ppf(0.05, freedom) / freedom
+    got = interpolate_quantile(freedom, *quantile_curve)
+    np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-250)
+
+
+@pytest.mark.parametrize("decades", [np.inf, 10.0])
+def test_limit_of_a_cell_is_the_least_that_the_model_promises_among_all_cells(quantile_curve, decades):
+    """Every cell tried with scipy's quantile; a term's own part cannot be more than the cell."""
+    rng = np.random.default_rng(34)
+    ks = np.round(np.geomspace(1, 1000, 25))
+    columns = ks[:, None] ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    squares = np.array([1.0, 0.3, 0.01, 1e-4, 1e-7]) * rng.choice([0.0, 0.1, 1.0, 10.0, np.nan], (40, 5))
+    own = rng.uniform(0.5, 2.0, (5, 25)) * 3000 / ks
+    own[4] = np.inf
+    white, quantization, ramp = rng.uniform(0.5, 1.5, (3, 40, 25))
+    factor = np.where(rng.random((40, 1)) < 0.5, 1.0, rng.uniform(0.1, 1.0, (40, 25)))
+    response = np.stack([quantization, white, *np.ones((2, 40, 25)), ramp], axis=-1)
+    part = response * columns
+    model = (part * np.nan_to_num(squares)[:, None]).sum(axis=-1)
+    dof = rng.uniform(1.0, 3000.0, (40, 25))
+    avar = model * rng.chisquare(dof) / dof
+    avar[rng.random((40, 25)) < 0.1] = np.nan
+    span = np.array([np.inf, *[decades] * 4])
+    got = cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, own, ks, span, 1e6, *quantile_curve)
+    freedom = np.minimum(own.T * factor[..., None], 1e6)
+    freedom[..., 4] = np.minimum(freedom[..., 4], dof)
+    reach = 1.0 / (chi2.ppf(0.05, freedom) / freedom * part)
+    for w in range(40):
+        seen = np.isfinite(avar[w])
+        for a in range(5):
+            able = np.flatnonzero(seen & (ks * span[a] >= ks[seen].max()))
+            best = able[np.argmin(model[w, able] * reach[w, able, a])]
+            assert got[w, a] == pytest.approx(avar[w, best] * reach[w, best, a], rel=1e-6)
+
+
+def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
+    """Random walk alone, its covariances from the weights of the second differences on a sum of white noise."""
+    window, ks = 90, np.array([1, 3, 8, 20])
+    walk = np.tril(np.ones((window, window)))
+    differences = []
+    for k in ks:
+        rows = [np.concatenate([np.zeros(m), -np.ones(k), np.ones(k), np.zeros(window - m - 2 * k)]) for m in range(window - 2 * k + 1)]
+        differences.append(np.array(rows))
+    got, _ = product_tables(window, ks, np.zeros_like(ks))
+    for i, first in enumerate(differences):
+        for j, second in enumerate(differences):
+            white_part = first @ second.T / (2.0 * ks[i] * ks[j])
+            assert got[1, 1, i, j] == pytest.approx(2 * np.mean(white_part**2), rel=1e-9)
+            # the average over each interval of a Brownian motion: half of the step in it, and a part of its own
+            ends = walk - 0.5 * np.eye(window)
+            spread = ends @ ends.T + np.eye(window) / 12
+            walk_part = first @ spread @ second.T / (2.0 * ks[i] * ks[j])
+            assert got[3, 3, i, j] == pytest.approx(2 * np.mean(walk_part**2), rel=1e-9)
+            assert got[1, 3, i, j] == pytest.approx(2 * np.mean(white_part * walk_part), rel=1e-9)
+
+
+def test_every_number_carries_its_unit():
+    product = fit_noise(windows_of(np.random.default_rng(15).standard_normal((3, 1000))))
+    for term, law in LAWS.items():
+        assert product[term].units == law.units
+        assert product[term].unit_label == law.label
+        assert product[f"{term}_stderr"].units == law.units
+    np.testing.assert_allclose(product.N_squared, product.N**2)
+    assert product.K_squared.units == "degree2 hour-3"
+
+
+def test_bad_calls_are_explained():
+    surface = windows_of(np.random.default_rng(16).standard_normal((3, 1000)))
+    with pytest.raises(OptionError, match="Q, N, B, K, R"):
+        fit_noise(surface, terms="NX")
+    with pytest.raises(OptionError, match="gls"):
+        fit_noise(surface, method="slope")
+    with pytest.raises(SchemaError, match="avar"):
+        fit_noise(surface.drop_vars("avar"))
+    with pytest.raises(SchemaError, match="white_response"):
+        fit_noise(surface.drop_vars("white_response"))
+    with pytest.raises(OptionError, match="between 0 and 1"):
+        confidence_interval(surface, level=95)
+
+
+@pytest.mark.parametrize("block", [5, 50])
+def test_a_ramp_far_above_the_noise_fits_through_gaps(block):
+    """Lost samples move the centres of clusters apart, or together; with that in its column a ramp is one of the five terms again."""
+    rng = np.random.default_rng([31, block])
+    x = white(rng, 100, 4000, N=0.01, rate=RATE) + 3000.0 * np.arange(4000) / RATE / 3600
+    surface = windows_of(lose(rng, x, 0.2, block), taus=24)
+    bare = surface.assign(ramp_response=xr.ones_like(surface.ramp_response))
+    fails = [float((chi2.sf(one.fit_chi2, one.fit_dof) < 1e-3).mean()) for one in (fit_noise(surface), fit_noise(bare))]
+    assert fails[0] < (0.02 if block == 5 else 0.06)
+    assert block == 5 or fails[1] > 0.15
+    old = surface.drop_vars("ramp_response")  # as a version wrote it that took the response of a ramp as 1
+    xr.testing.assert_equal(fit_noise(old), fit_noise(bare).drop_vars("ramp_response"))

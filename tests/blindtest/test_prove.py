@@ -1,0 +1,373 @@
+"""The benchmark runs, seals before it looks, goes on where it stopped, and counts what is on the disk."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import xarray as xr
+
+import gyrostab
+from gyrostab.blindtest.runner.benchmark import Proof
+from gyrostab.blindtest.runner.folder import TUNING, case_name, read_sums
+from gyrostab.blindtest.runner.outcome import page_text, score_rows
+from gyrostab.blindtest.runner.pool import each_in_processes
+from gyrostab.blindtest.scenarios.plan import plan_case
+from gyrostab.blindtest.scoring.table import score_table
+from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError, WorkerError
+from tests.support.command_line import call
+
+core = importlib.import_module("gyrostab.blindtest.runner.benchmark")
+diagnosing = importlib.import_module("gyrostab.diagnose.core")
+
+SMALL = {"rate": 10.0, "seconds": 600, "gaps": 0.0, "cuts": 0, "heavy": False, "severing": None}
+#: Effect and strength of each case, none for noise alone.
+CASES: tuple[tuple[str, float] | None, ...] = (None, ("spectral_line", 8.0))
+
+
+def small_plans(number: int, *, seed: int) -> list[dict]:
+    plans = []
+    for index, drawn in zip(range(number), CASES, strict=False):
+        names, strengths = ([drawn[0]], [drawn[1]]) if drawn else ([], [])
+        kind = "single" if drawn else "null"
+        plans.append(plan_case(index, seed=seed) | SMALL | {"kind": kind, "names": names, "strengths": strengths})
+    return plans
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> tuple[Path, list[str], Proof]:
+    """A benchmark of two small cases, and what was said and present at each moment."""
+    folder, said = tmp_path_factory.mktemp("finished") / "proof", []
+
+    def say(text: str) -> None:
+        said.append(f"{text} [{len(list((folder / 'diagnoses').glob('*.json')))} diagnosed]")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
+        proof = gyrostab.prove(folder, cases=2, seed=5, nulls=100, workers=0, say=say)
+    return folder, said, proof
+
+
+def test_the_truths_are_sealed_and_told_before_the_first_diagnosis(finished):
+    folder, said, proof = finished
+    sums = (folder / "SHA256SUMS").read_bytes()
+    assert proof.sealed == hashlib.sha256(sums).hexdigest()
+    assert any(proof.sealed in text and "[0 diagnosed]" in text for text in said)
+    assert "--seed 5" in said[0]
+    for line in sums.decode().splitlines():
+        value, path = line.split("  ")
+        assert hashlib.sha256((folder / path).read_bytes()).hexdigest() == value
+    assert len(sums.splitlines()) == 2
+    written = [path.stat().st_mtime_ns for path in (folder / "diagnoses").glob("*.json")]
+    assert (folder / "SHA256SUMS").stat().st_mtime_ns < min(written)
+
+
+def test_nothing_of_the_truth_is_in_name_or_content_of_a_recording(finished):
+    folder, *_ = finished
+    recordings = sorted((folder / "recordings").iterdir())
+    assert sorted(path.stem for path in recordings) == sorted(case_name(5, index) for index in range(2))
+    for path in recordings:
+        with xr.open_dataset(path) as log:
+            said = json.dumps([str(log.attrs), *(str(log[name].attrs) for name in log.variables), *map(str, log.variables)])
+        for word in ("spectral", "ageing", "null", "single", "seed", "strength", "concealed", "plan"):
+            assert word not in said.lower()
+
+
+def test_every_case_is_counted(finished):
+    folder, _, proof = finished
+    scores = pd.read_csv(folder / "scores.csv", keep_default_na=False, na_values=[""])
+    assert list(scores["kind"]) == ["null", "single"]
+    assert list(scores["effect"].fillna("")) == ["", "spectral_line"]
+    line = scores.iloc[1]
+    assert bool(line["detected"])
+    found = json.loads((folder / "diagnoses" / f"{line['name']}.json").read_text())
+    assert line["verdict"] == found["verdict"]
+    assert [name for name, _ in json.loads(line["claims"])] == [effect["name"] for effect in found["effects"]]
+    assert {"Allan plot", "correlation with channels"} == set(json.loads(line["naive"]))
+    assert proof.failed == {}
+    text = (folder / "table.md").read_text()
+    assert proof.sealed in text
+    assert "not for publication" in text
+    detected = proof.table.set_index("quantity").loc["detected at 1.5 times the limit and more"]
+    assert detected["n"] == 1
+    assert detected["value"] == pytest.approx(scores["detected"][1:].mean())
+    for name in ("completeness.png", "reliability.png"):
+        assert (folder / name).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_second_run_only_counts_again_and_comes_to_the_same(finished, small):
+    folder, _, before = finished
+    kept = {path: path.stat().st_mtime_ns for path in folder.glob("*/*")}
+    scores = (folder / "scores.csv").read_bytes()
+    again = gyrostab.prove(folder, workers=0, resume=True)
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*")} == kept
+    assert (folder / "scores.csv").read_bytes() == scores
+    assert again.seed == 5
+    assert again.sealed == before.sealed
+
+
+def test_a_truth_that_was_changed_is_not_opened(finished, small):
+    folder, *_ = finished
+    name = case_name(5, 1)
+    path = folder / "truth" / f"{name}.json"
+    text = path.read_text()
+    try:
+        path.write_text(text.replace('"strength": 8.0', '"strength": 4.0'))
+        with pytest.raises(FormatError, match="changed after it was sealed"):
+            gyrostab.prove(folder, workers=0, resume=True)
+    finally:
+        path.write_text(text)
+
+
+def test_what_was_begun_is_neither_lost_nor_mixed(finished):
+    folder, *_ = finished
+    with pytest.raises(OutputError, match="--resume"):
+        gyrostab.prove(folder)
+    with pytest.raises(ResumeError, match="seed 5, not 6"):
+        gyrostab.prove(folder, seed=6, resume=True)
+    with pytest.raises(ResumeError, match="cases 2, not 4"):
+        gyrostab.prove(folder, cases=4, resume=True)
+    assert (folder / "scores.csv").exists()
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_a_stopped_run_goes_on_and_comes_to_what_an_unbroken_one_does(finished, small, tmp_path, monkeypatch):
+    unbroken, _, _ = finished
+    folder, calls = tmp_path / "proof", []
+
+    def real(recording, target, failed, nulls):
+        shutil.copy(unbroken / "diagnoses" / target.name, target)  # the same recording, so the same diagnosis
+        return True
+
+    def stop_at_the_second(*job):
+        if calls:
+            raise Stopped
+        calls.append(job[0])
+        return real(*job)
+
+    monkeypatch.setattr(core, "diagnose_case", stop_at_the_second)
+    with pytest.raises(Stopped):
+        gyrostab.prove(folder, cases=2, seed=5, nulls=100, workers=0)
+    assert len(list((folder / "diagnoses").iterdir())) == 1
+    assert not (folder / "scores.csv").exists()
+    sums = (folder / "SHA256SUMS").read_bytes()
+    leftover = folder / "diagnoses" / ".abc.json.gyrostab-12345678.part"
+    leftover.write_text("half")
+
+    later = []
+    monkeypatch.setattr(core, "diagnose_case", lambda *job: later.append(job[0]) or real(*job))
+    gyrostab.prove(folder, workers=0, resume=True)
+    assert set(later).isdisjoint(calls)
+    assert len(later) == 1
+    assert not leftover.exists()
+    assert (folder / "SHA256SUMS").read_bytes() == sums == (unbroken / "SHA256SUMS").read_bytes()
+    for recording in (unbroken / "recordings").iterdir():
+        with xr.open_dataset(recording) as one, xr.open_dataset(folder / "recordings" / recording.name) as other:
+            xr.testing.assert_identical(one, other)
+    assert (folder / "scores.csv").read_bytes() == (unbroken / "scores.csv").read_bytes()
+
+
+def test_a_diagnosis_that_fails_is_shown_and_tried_again(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: 1 / 0)
+    proof = gyrostab.prove(tmp_path / "proof", cases=2, seed=9, nulls=100, workers=0)
+    assert set(proof.failed) == {case_name(9, 0), case_name(9, 1)}
+    text = (tmp_path / "proof" / "table.md").read_text()
+    assert "ZeroDivisionError: division by zero" in text
+    assert "its diagnosis failed" in text
+    detected = proof.table.set_index("quantity").loc["detected at 1.5 times the limit and more"]
+    assert (detected["n"], detected["value"]) == (1, 0.0)
+
+    class Found:
+        def to_json(self) -> str:
+            return json.dumps({"verdict": "unknown", "mismatches": [], "effects": [], "unexplained": [], "held_out": {}})
+
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: Found())
+    again = gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
+    assert again.failed == {}
+    assert not list((tmp_path / "proof" / "failed").iterdir())
+    assert again.table.set_index("quantity").loc["detected at 1.5 times the limit and more", "value"] == 1.0
+
+
+class NothingFound:
+    def to_json(self) -> str:
+        return json.dumps({"verdict": "no mismatch", "mismatches": [], "effects": [], "unexplained": [], "held_out": {}})
+
+
+def test_real_recordings_are_salted_sealed_and_told_apart(small, tmp_path, monkeypatch, recordings):
+    real = recordings("mems-static-53min/ch104.csv.gz").parents[1]
+    monkeypatch.setattr(core, "_SALTED", 1)
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
+    said: list[str] = []
+    proof = gyrostab.prove(tmp_path / "proof", cases=2, seed=8, nulls=100, workers=0, real=real, say=said.append)
+    assert "2 real recordings" in said[0]
+    sums, _ = read_sums(tmp_path / "proof")
+    assert len(sums) == 2 + 2 * 4
+    for path in (tmp_path / "proof" / "recordings").iterdir():
+        with xr.open_dataset(path) as log:
+            words = json.dumps([path.name, str(log.attrs), *map(str, log.variables)]).lower()
+        assert not [word for word in ("salt", "copy", "flipped", "reversed", "untouched", "mems", "laser", "fog") if word in words]
+    scores = pd.read_csv(tmp_path / "proof" / "scores.csv", keep_default_na=False, na_values=[""])
+    assert sorted(scores["kind"].value_counts().to_dict().items()) == [("control", 6), ("null", 1), ("salted", 2), ("single", 1)]
+    assert set(scores["copy"].dropna()) == {"salted", "untouched", "flipped", "reversed"}
+    counted = proof.table.set_index("quantity")
+    assert counted.loc["false alarms: a name on a null", "n"] == 1  # a copy of a real recording is no null
+    page = (tmp_path / "proof" / "table.md").read_text()
+    assert "| turning the sign brings a name | 0 |" in page
+
+
+def test_a_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
+    said: list[str] = []
+    gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, say=said.append)
+    assert "no real recordings are salted" in said[0]
+    assert "the folder of the real recordings was not given" in (tmp_path / "proof" / "table.md").read_text()
+
+
+def test_real_recordings_that_went_away_before_the_draw(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(core, "_SALTED", 1)
+    with pytest.raises(FormatError, match="nowhere"):
+        gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, real=tmp_path / "nowhere")
+    with pytest.raises(ResumeError, match="say again where they are"):
+        gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
+
+
+def test_wrong_names_on_noise_are_listed():
+    truth = {"effects": [], "accepted": [], "plan": {"index": 0, "kind": "null"}, "sampling_rate_hz": 10.0, "seconds": 600.0}
+    truth |= {"missing_share": 0.0}
+    claim = {
+        "verdict": "explained",
+        "mismatches": [],
+        "unexplained": [],
+        "held_out": {},
+        "effects": [{"name": "shupe", "alternatives": []}],
+    }
+    rows = score_rows({"abc": claim}, {"abc": truth}, {"abc": {}})
+    job = {"cases": 1, "seed": TUNING + 1, "nulls": 100, "code": ["a", "b"], "begun": "now", "machine": "any"}
+    table = score_table(rows)
+    text = page_text(rows, table, job=job, sealed="0" * 64, failed={})
+    assert "abc (null, 10 Hz, 10 min, 0 % lost): nothing; named shupe" in text
+    assert "not for publication" not in text
+    assert "The code changed 1 times" in text
+    assert "false alarms: a name on a null: 1 " in text
+
+
+# ------------------------------------------------------------------------------------------------------------------- manners
+
+
+def test_options_that_make_no_sense_leave_nothing_behind(tmp_path):
+    for options, complaint in (({"cases": 0}, "cases=0"), ({"seed": -1}, "seed=-1"), ({"nulls": 20}, "nulls=20")):
+        with pytest.raises(OptionError, match=complaint):
+            gyrostab.prove(tmp_path / "proof", **options)
+    with pytest.raises(OutputError, match="there is no directory"):
+        gyrostab.prove(tmp_path / "no" / "proof")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="is a file"):
+        gyrostab.prove(tmp_path / "file")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_folder_with_other_things_is_never_emptied(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    for options in ({}, {"overwrite": True}, {"resume": True}):
+        with pytest.raises(OutputError, match=r"thesis\.tex"):
+            gyrostab.prove(tmp_path, cases=1, **options)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_overwrite_forgets_what_was_there(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: 1 / 0)
+    first = gyrostab.prove(tmp_path / "proof", cases=1, seed=1, workers=0)
+    second = gyrostab.prove(tmp_path / "proof", cases=1, workers=0, overwrite=True)
+    assert second.seed >= TUNING != first.seed
+    assert list(read_sums(tmp_path / "proof")[0]) == [case_name(second.seed, 0)]
+    assert [path.stem for path in (tmp_path / "proof" / "recordings").iterdir()] == [case_name(second.seed, 0)]
+
+
+def test_only_one_run_works_in_a_folder(small, tmp_path):
+    from gyrostab.jobs.job import hold
+
+    (tmp_path / "proof").mkdir()
+    code = f"import gyrostab; gyrostab.prove({str(tmp_path / 'proof')!r}, cases=1, seed=1)"
+    with hold(tmp_path / "proof"):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "ResumeError" in done.stderr
+    assert [path.name for path in (tmp_path / "proof").iterdir()] == ["lock"]
+
+
+def test_the_command_warns_of_a_tuning_seed_and_says_what_is_wrong(tmp_path, capfd):
+    (tmp_path / "other.txt").write_text("")
+    assert call("prove", "--cases", 1, "--seed", 3, "-o", tmp_path) == 2
+    said = capfd.readouterr().err
+    assert "tuning" in said
+    assert "other.txt" in said
+    assert call("prove", "--cases", 1, "--seed", TUNING, "-o", tmp_path) == 2
+    assert "tuning" not in capfd.readouterr().err
+
+
+# ----------------------------------------------------------------------------------------------------------------- processes
+
+
+def test_processes_keep_the_order_and_use_one_thread():
+    told: list[int] = []
+    before = os.environ.get("OMP_NUM_THREADS")
+    done = each_in_processes(os.path.join, [("a", str(number)) for number in range(5)], workers=2, told=told.append)
+    assert done == [os.path.join("a", str(number)) for number in range(5)]
+    assert told == [1, 2, 3, 4, 5]
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    assert each_in_processes(os.getenv, [(name,) for name in names], workers=1) == ["1", "1", "1"]
+    assert os.environ.get("OMP_NUM_THREADS") == before
+
+
+def test_a_process_that_dies_is_told_with_what_to_do():
+    with pytest.raises(WorkerError, match="--resume"):
+        each_in_processes(os._exit, [(1,)], workers=1)
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks at processes in /proc")
+def test_no_process_outlives_a_killed_parent():
+    work = "each_in_processes(time.sleep, [(300,), (300,)], workers=2)"
+    code = f"import time\nfrom gyrostab.blindtest.runner.pool import each_in_processes\n{work}\n"
+    parent = subprocess.Popen([sys.executable, "-c", f"if __name__ == '__main__':\n    {code.replace(chr(10), chr(10) + '    ')}"])
+    try:
+        children = wait_for(lambda: working(parent.pid))
+    finally:
+        parent.kill()
+        parent.wait()
+    assert wait_for(lambda: not any(Path(f"/proc/{child}/task").exists() for child in children))
+
+
+def working(parent: int) -> list[int]:
+    """Its two working processes, once both have loaded what they need and sleep."""
+    children = [int(number) for number in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
+    children = [child for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
+    ready = [child for child in children if len(list(Path(f"/proc/{child}/task").iterdir())) > 1]
+    return ready if len(ready) == 2 else []
+
+
+def wait_for(truth, *, seconds: float = 30.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        try:
+            if found := truth():
+                return found
+        except OSError:
+            pass
+        time.sleep(0.05)
+    return None

@@ -1,0 +1,72 @@
+"""A small benchmark with a seed that nobody has seen: what must hold of any cases whatever.
+
+The seed is printed; `GYROSTAB_PROVE_SEED=... python -m pytest tests/blindtest/test_prove_fresh.py` does the same again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+
+import pandas as pd
+import pytest
+
+import gyrostab
+from gyrostab.blindtest.runner.folder import TUNING
+from gyrostab.blindtest.scenarios.plan import plan_case
+from gyrostab.blindtest.scoring.table import score_table
+from gyrostab.diagnose.result.diagnosis import check_diagnosis
+
+NUMBER = 5
+
+
+def short_plans(number: int, *, seed: int) -> list[dict]:
+    """The drawn cases, each as it is but short and slow; a buried effect needs a record that is long enough to bury it in."""
+    plans = [plan_case(index, seed=seed) for index in range(number)]
+    return [plan | {"rate": 10.0, "seconds": 3000.0 if plan["kind"] == "buried" else 600.0} for plan in plans]
+
+
+@pytest.mark.timeout(1800)
+def test_any_cases_are_diagnosed_sealed_and_counted(tmp_path, monkeypatch, capsys):
+    seed = int(os.environ.get("GYROSTAB_PROVE_SEED") or TUNING + secrets.randbelow(10**9))
+    with capsys.disabled():
+        print(f"\nfresh cases of seed {seed}: GYROSTAB_PROVE_SEED={seed} draws them again")
+    monkeypatch.setattr("gyrostab.blindtest.plan_cases", short_plans)
+    folder = tmp_path / "proof"
+    proof = gyrostab.prove(folder, cases=NUMBER, seed=seed, nulls=100, workers=0)
+
+    assert proof.failed == {}
+    assert proof.seed == seed
+    sums = (folder / "SHA256SUMS").read_text()
+    assert hashlib.sha256(sums.encode()).hexdigest() == proof.sealed
+    names = []
+    for line in sums.splitlines():
+        value, path = line.split("  ")
+        assert hashlib.sha256((folder / path).read_bytes()).hexdigest() == value
+        names.append(path.removeprefix("truth/").removesuffix(".json"))
+    assert len(names) == NUMBER
+
+    rows = pd.read_csv(folder / "scores.csv", keep_default_na=False, na_values=[""])
+    assert set(rows["name"]) == set(names)
+    assert not rows["failed"].any()
+    for name in names:
+        found = json.loads((folder / "diagnoses" / f"{name}.json").read_text())
+        check_diagnosis(found)
+        truth = json.loads((folder / "truth" / f"{name}.json").read_text())
+        mine = rows[rows["name"] == name]
+        assert len(mine) == max(1, len(truth["effects"]))
+        assert sorted(mine["effect"].dropna()) == sorted(effect["name"] for effect in truth["effects"])
+        assert set(mine["verdict"]) == {found["verdict"]}
+        assert {claim[0] for claim in json.loads(mine.iloc[0]["claims"])} == {effect["name"] for effect in found["effects"]}
+
+    assert list(proof.table["quantity"][:10]) == list(score_table([])["quantity"][:10])  # every figure has its line
+    assert set(proof.table["state"]) <= {"", "met", "missed", "not shown"}
+    counted = proof.table.set_index("quantity")
+    assert counted.loc["false alarms: a name on a null", "n"] == (rows["kind"] == "null").sum()
+    page = (folder / "table.md").read_text()
+    assert str(seed) in page
+    assert proof.sealed in page
+    for name in ("completeness.png", "reliability.png"):
+        assert (folder / name).read_bytes()[:4] == b"\x89PNG"

@@ -1,0 +1,282 @@
+"""Coupling with a channel: what is there is found, what is not is not, and the intervals hold."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import cf_units
+import numpy as np
+import pytest
+import xarray as xr
+
+import gyrostab
+from gyrostab.cli import main
+from gyrostab.correlate.judge import VERDICTS
+from gyrostab.errors import OptionError, TimeError
+from gyrostab.kernels.regression.coupling import averages, beside, calibrated, decompose, fit_lags, slope_interval, uncalibrated
+from tests.support import coupled, synthetic
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def verdict(found: xr.Dataset, **where: str) -> str:
+    return VERDICTS[int(found["coupling_verdict"].sel(**where))]
+
+
+def test_slope_and_lag_are_found_and_quiet_axes_are_not_accused():
+    found = gyrostab.correlate(coupled.product(slope=0.3, lag=4, noises="white"), max_lag="5min")
+    place = {"axis": "x", "variable": "window_mean", "driver": "temperature"}
+    assert verdict(found, **place) == "coupled"
+    assert abs(float(found["coupling_lag"].sel(place)) - 120) <= 60
+    assert float(found["window_mean_per_temperature_low"][0]) < 0.3 < float(found["window_mean_per_temperature_high"][0])
+    assert (found["coupling_verdict"].sel(axis=["y", "z"]) == VERDICTS.index("none_seen")).all()
+    assert "follows temperature" in str(found["statement"].sel(place).values)
+
+
+def test_rate_of_change_is_found():
+    found = gyrostab.correlate(coupled.product(pace=0.05, noises="white"), variables="window_mean", max_lag=0)
+    assert verdict(found, axis="x", variable="window_mean", driver="temperature_rate") == "coupled"
+    low, high = (float(found[f"window_mean_per_temperature_rate_{end}"][0]) for end in ("low", "high"))
+    assert low < 0.05 < high
+
+
+def test_ramps_are_fitted_apart():
+    found = gyrostab.correlate(coupled.product(slope=0.3, noises="white", windows=240), variables="window_mean", max_lag=0)
+    for way in ("rising", "falling"):
+        slope, error = (float(found[f"window_mean_per_temperature_{way}{end}"][0]) for end in ("", "_stderr"))
+        assert abs(slope - 0.3) < 4 * error < 0.2
+
+
+def test_white_law_is_ordinary_least_squares():
+    rng = np.random.default_rng(3)
+    y, x = rng.normal(size=(40, 1)), rng.normal(size=(40, 1))
+    fit = fit_lags(beside(decompose([np.eye(40)], np.zeros(1)), np.ones((40, 1))), y, x)
+    design = np.concatenate([np.ones((40, 1)), x], axis=1)
+    solved, rest, *_ = np.linalg.lstsq(design, y, rcond=None)
+    assert fit.slope[0, 0, 0] == pytest.approx(solved[1, 0])
+    error = np.sqrt(rest[0] / 38 * np.linalg.inv(design.T @ design)[1, 1])
+    assert fit.stderr[0, 0, 0] == pytest.approx(error)
+    assert slope_interval(fit, 0, 0, 0.05)[3] == pytest.approx(solved[1, 0] + 2.024394 * error, rel=1e-5)
+
+
+def test_overlap_of_windows_is_counted():
+    """Against the variance of block means of windows that are cut from white noise."""
+    rng = np.random.default_rng(4)
+    cells = rng.normal(size=(20000, 14))
+    windows = 0.5 * (cells[:, 1:] + cells[:, :-1])[:, :12]
+    mean, _, white = averages(np.repeat(np.arange(3), 4), np.arange(12) * 30.0, 60.0, np.ones(12))
+    blocks = windows @ mean.toarray().T
+    np.testing.assert_allclose(np.cov(blocks.T) * 2, white, atol=0.02)  # a full window of two cells has variance 1/2
+
+
+def test_a_share_of_simulated_noise_and_its_p_value_belong_together():
+    chance = np.random.default_rng(6).uniform(size=2000) ** 2  # P(p <= x) = sqrt(x)
+    for p in (1e-6, 1e-3, 0.05, 0.3, 0.9):
+        assert calibrated(p, chance) == pytest.approx(np.sqrt(p), rel=1.0 if p < 1e-4 else 0.3)
+        assert uncalibrated(calibrated(p, chance), chance) == pytest.approx(p, rel=1e-6)
+
+
+@pytest.mark.parametrize(("noises", "heat", "gap"), [("white", "sine", True), ("flicker", "sine", False), ("walk", "ramps", True)])
+def test_intervals_hold_and_agree_with_the_p_values(noises, heat, gap):
+    hold = []
+    for seed in range(8):
+        product = coupled.product(seed=40_000 + seed, noises=noises, heat=heat, slope=0.5, windows=80, terms=False, gap=gap)
+        found = gyrostab.correlate(product, max_lag=0)
+        low, high = found["window_mean_per_temperature_low"].values, found["window_mean_per_temperature_high"].values
+        hold += list((low < [0.5, 0, 0]) & (high > [0.5, 0, 0]))
+        p = found["p_value"].sel(variable="window_mean", driver="temperature").values
+        np.testing.assert_array_equal((low > 0) | (high < 0), p < 0.05)
+        assert (found["p_value_adjusted"] >= found["p_value"]).where(found["p_value"].notnull(), True).all()
+    assert np.mean(hold) > 0.80  # 0.95 less three standard errors of 24 shares
+
+
+@pytest.mark.parametrize(("noises", "heat"), [("flicker", "sine"), ("slow", "walk")])
+def test_nothing_is_invented(noises, heat):
+    claims = 0
+    for seed in range(8):
+        product = coupled.product(seed=50_000 + seed, noises=noises, heat=heat, windows=80, terms=False)
+        claims += bool((gyrostab.correlate(product, max_lag="8min")["coupling_verdict"] == VERDICTS.index("coupled")).any())
+    assert claims <= 2  # of 8 at the rate of 5 %: more happens once in 170
+
+
+def test_the_search_is_paid_for():
+    """The p-value for the whole search against that of the chosen lag: 12 lags of a driver without memory are worth many tests."""
+    product = coupled.product(noises="white", terms=False, axes="x")
+    rng = np.random.default_rng(7)
+    product["temperature"] = product["temperature"].copy(data=30 + rng.normal(size=120).cumsum() * 0.2 + rng.normal(size=120))
+    found = gyrostab.correlate(product).sel(axis="x", variable="window_mean", driver="temperature")
+    both = gyrostab.correlate(product, max_lag=0).sel(axis="x", variable="window_mean")
+    assert float(found["p_value_adjusted"]) > 4 * float(found["p_value"])
+    smaller = both["p_value"].min()
+    assert float(both["p_value_adjusted"].min()) == pytest.approx(min(1.0, 2 * float(smaller)))  # two drivers, Holm
+
+
+def test_autocorrelated_samples_count_less():
+    many = gyrostab.correlate(coupled.product(noises="white", terms=False), max_lag=0)["effective_samples"].sel(driver="temperature")
+    few = gyrostab.correlate(coupled.product(noises="walk", terms=False), max_lag=0)["effective_samples"].sel(driver="temperature")
+    assert 20 < float(many.median()) <= 60  # 108 windows that overlap by half, in blocks of a window
+    assert float(few.median()) < 20
+
+
+def test_a_record_that_cannot_tell_says_why():
+    flat = gyrostab.correlate(coupled.product(heat="flat"), variables="window_mean")
+    assert (flat["coupling_verdict"] == VERDICTS.index("cannot_tell")).all()
+    assert "temperature is constant" in str(flat["statement"].values[0, 0, 0])
+    few = gyrostab.correlate(coupled.product(windows=16), variables="window_mean")
+    assert "too few independent windows" in str(few["statement"].values[0, 0, 0])
+    rise = gyrostab.correlate(coupled.product(heat="rise", slope=1.0, noises="white"), variables="window_mean", max_lag=0)
+    assert verdict(rise, axis="x", variable="window_mean", driver="temperature") == "not_told_apart"
+    assert "never turns" in str(rise["statement"].values[0, 0, 0])
+
+
+def test_two_clusters_across_a_gap_are_no_slope():
+    product = coupled.product(windows=160, noises="white", gap=False)
+    late = np.arange(160) >= 80
+    rng = np.random.default_rng(5)
+    product["temperature"] = product["temperature"].copy(data=26 + 6.0 * late + rng.normal(0, 0.05, 160))
+    product["window_mean"] = product["window_mean"] + 30.0 * late
+    product["window_mean"][:, 50:110] = np.nan
+    found = gyrostab.correlate(product, variables="window_mean", max_lag=0)
+    assert set(found["coupling_verdict"].sel(driver="temperature").values.ravel()) == {VERDICTS.index("cannot_tell")}
+    assert "a gap parts" in str(found["statement"].values[0, 0, 0])
+
+
+def test_channel_of_a_file_is_averaged_and_never_extrapolated(tmp_path):
+    product = coupled.product(slope=0.3, noises="white", gap=False)
+    stamps = product["time_bounds"].values[0, 0] + (np.arange(2400) * 1_000_000_000).astype("timedelta64[ns]")
+    seconds = np.arange(2400.0)
+    probe = xr.DataArray(20 + 5 * np.sin(seconds / 300), dims="t", coords={"t": stamps}, name="probe", attrs={"units": "degree_Celsius"})
+    found = gyrostab.correlate(product, channel=probe, variables="window_mean", max_lag=0)
+    np.testing.assert_allclose(found["probe"][3], probe[90:150].mean())
+    assert np.isnan(found["probe"].values[80:]).all()
+    with pytest.raises(TimeError, match="do not overlap"):
+        gyrostab.correlate(product, channel=probe.assign_coords(t=stamps - np.timedelta64(9, "D")))
+
+
+def hours(values, product, every):
+    stamps = product["time_bounds"].values[0, 0] + (np.arange(values.size) * int(every * 1e9)).astype("timedelta64[ns]")
+    return xr.DataArray(values, dims="t", coords={"t": stamps}, name="probe", attrs={"units": "degree_Celsius"})
+
+
+def test_short_holes_of_a_channel_are_bridged_and_long_ones_are_not():
+    product = coupled.product(noises="white", gap=False, terms=False)
+    seconds = np.arange(3630.0)
+    course = 20 + 5 * np.sin(seconds / 300)
+    holed = course.copy()
+    holed[600:655] = np.nan  # less than a window of 60 s
+    holed[2000:2300] = np.nan  # five windows, a twelfth of the record
+    seen = gyrostab.correlate(product, channel=hours(holed, product, 1.0), variables="window_mean", max_lag=0)["probe"].values
+    whole = np.array([course[30 * i : 30 * i + 60].mean() for i in range(120)])
+    inside = np.flatnonzero((np.arange(120) * 30 >= 1990) & (np.arange(120) * 30 + 60 <= 2310))
+    assert inside.size > 5
+    assert np.isnan(seen[inside]).all()
+    np.testing.assert_allclose(seen[15:30], whole[15:30], atol=0.6)
+    assert np.isnan(seen).sum() < inside.size + 5
+
+
+def test_a_slow_channel_is_interpolated_between_its_values_only():
+    product = coupled.product(noises="white", gap=False, terms=False)
+    at = np.arange(0.0, 3300.0, 150.0)
+    seen = gyrostab.correlate(product, channel=hours(20 + at / 100, product, 150.0), variables="window_mean", max_lag=0)["probe"].values
+    middle = np.arange(120) * 30 + 30.0
+    known = middle <= at[-1]
+    np.testing.assert_allclose(seen[known], 20 + middle[known] / 100, rtol=1e-12)
+    assert np.isnan(seen[~known]).all()
+
+
+def test_command_refuses_options_that_it_has_no_use_for(stored, capsys):
+    assert main(["correlate", str(stored), "--rate", "100"]) == 2
+    assert "--rate" in capsys.readouterr().err
+    assert main(["correlate", str(stored), "--map", "T=temperature"]) == 2
+    assert "name that file too" in capsys.readouterr().err
+
+
+def test_errors_say_what_to_do():
+    product = coupled.product()
+    with pytest.raises(OptionError, match="no channel 'vibration'; it has temperature"):
+        gyrostab.correlate(product, channel="vibration")
+    with pytest.raises(OptionError, match="longer than the record"):
+        gyrostab.correlate(product, max_lag="3D")
+    with pytest.raises(OptionError, match="variable 'avar'"):
+        gyrostab.correlate(product, variables="avar")
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory) -> Path:
+    return gyrostab.to_netcdf(coupled.product(slope=0.3, noises="white"), tmp_path_factory.mktemp("coupled") / "product.nc")
+
+
+def test_command_writes_legal_units_and_a_figure(stored, tmp_path, capsys):
+    target = tmp_path / "out.nc"
+    assert main(["correlate", str(stored), "--with", "temperature", "--max-lag", "5min", "-o", str(target)]) == 0
+    printed = capsys.readouterr().out
+    assert "Window mean of axis x follows temperature" in printed
+    assert target.with_suffix(".png").stat().st_size > 10_000
+    with gyrostab.open_product(target) as found:
+        units = found["window_mean_per_temperature"].attrs["units"]
+        assert cf_units.Unit(units) == cf_units.Unit("degree hour-1") / cf_units.Unit("K")
+    checker = Path(sys.executable).with_name("compliance-checker")
+    offline = {**os.environ, "http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+    done = subprocess.run([checker, "-t", "cf:1.11", "-c", "strict", target], capture_output=True, text=True, check=False, env=offline)
+    assert "All tests passed!" in done.stdout, done.stdout
+
+
+def test_pipeline_joins_another_teams_file(stored, tmp_path):
+    plan = tomllib.loads((ROOT / "pipelines" / "temperature_chain.toml").read_text(encoding="utf-8"))
+    product = gyrostab.open_product(stored)
+    (tmp_path / plan["product"]).write_bytes(stored.read_bytes())
+    lines = [f"{t},{v:.4f}" for t, v in zip(product["time"].values, product["temperature"].values, strict=True)]
+    (tmp_path / plan["channel"]["file"]).write_text("\n".join(["time,T_probe", *lines]), encoding="utf-8")
+    (tmp_path / "plan.toml").write_bytes((ROOT / "pipelines" / "temperature_chain.toml").read_bytes())
+    done = subprocess.run(
+        [sys.executable, ROOT / "pipelines" / "temperature_chain.py", tmp_path / "plan.toml"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Window mean of axis x follows temperature of file" in done.stdout
+    assert {"coupling.nc", "coupling.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+WARM_UP = {"map": {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z", "Tx": "temperature"}}
+WARM_UP["unit"] = {"gyro": "deg/s", "time": "s", "temperature": "degC"}
+MPU = {"map": {"gx_dps": "gyro_x", "gy_dps": "gyro_y", "gz_dps": "gyro_z", "temp_C": "temperature"}}
+MPU["unit"] = {"gyro": "deg/s", "temperature": "degC"}
+ROCKET = {"temperature_celsius": "temperature [degC]"}
+ROCKET |= {f"raw_angular_rate_{axis}_deg_per_s": f"gyro_{axis} [deg/s]" for axis in "xyz"}
+
+
+@pytest.mark.parametrize(
+    ("name", "read", "window", "step", "following", "quiet"),
+    [
+        ("fog-hybrid-warmup/run1_static.txt", WARM_UP, "2.5s", "0.5s", "y", "z"),
+        ("mpu6050-static-temperature/mpu6050_10min.csv.gz", MPU, "20s", "5s", "x", "z"),
+        ("rocket-flight-temperature/jackpot_launch_1.csv", {"map": ROCKET}, "5s", "1s", "", "xyz"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_real_recordings(recordings, name, read, window, step, following, quiet):
+    log = gyrostab.regularise(gyrostab.read_log(recordings(name), **read))
+    product = gyrostab.fit_noise(gyrostab.davar(log, window=window, step=step, taus=8))
+    whole = gyrostab.correlate(product, variables="window_mean")
+    found = whole["coupling_verdict"].sel(variable="window_mean")
+    for axis in following:
+        assert VERDICTS[int(found.sel(axis=axis, driver="temperature"))] in ("coupled", "not_told_apart")
+        said = str(whole["statement"].sel(variable="window_mean", axis=axis, driver="temperature").values)
+        assert "temperature never turns" in said
+        assert "change together" in said or float(whole["p_value"].sel(variable="window_mean", axis=axis, driver="temperature")) < 0.05
+    for axis in quiet:
+        assert set(found.sel(axis=axis).values) <= {VERDICTS.index("cannot_tell"), VERDICTS.index("none_seen")}
+
+
+def test_a_term_seen_in_scattered_windows_only_is_no_ground_for_a_verdict():
+    """Each window a stretch of its own leaves nothing to tell a slope from."""
+    product = synthetic.product()
+    found = gyrostab.correlate(product)
+    assert np.isfinite(found["p_value"].sel(variable="window_mean")).any()
+    seen = product["observable"].sel(axis="x", term="Q").values == 2
+    assert 12 < seen.sum() < 20
+    assert not (seen[1:] & seen[:-1]).any()  # enough windows, but none beside another
+    assert VERDICTS[int(found["coupling_verdict"].sel(axis="x", variable="Q").values[0])] == "cannot_tell"

@@ -1,0 +1,154 @@
+"""A lattice of rounded rates is told from one of angle steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate, from_model
+from gyrostab.diagnose.baseline.quantization_grid import angle_share, rounded_rates
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identifiability import structural
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.reduce.zero_bin import cut_off, may_be_cut_off
+from gyrostab.ingest.make_log import make_log
+from tests.support.named import nulls
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCATTER = 0.003 * 60.0 * np.sqrt(10.0)  # of a sample at 10 Hz [deg/h]
+
+
+def on_lattice(kind: str, steps: float, *, mean: float = 3.0, seed: int = 1, size: int = 18_000) -> xr.Dataset:
+    """White noise on two axes that stands on a lattice of so many scatters of its samples."""
+    rng = np.random.default_rng(seed)
+    rates = mean * np.array([[1.0], [-2.3]]) + SCATTER * rng.standard_normal((2, size))
+    step = steps * SCATTER
+    if kind == "angle":
+        counted = np.diff(np.floor(np.cumsum(rates, axis=1) / step + 0.3), axis=1, prepend=0.0) * step
+        return reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
+    return reduce_log(make_log(np.rint(rates / step) * step, rate=10.0, unit="deg/h"))
+
+
+@pytest.mark.parametrize("steps", [0.85, 1.5, 4.0])
+@pytest.mark.parametrize("mean", [3.0, 0.05])
+def test_steps_are_told_apart(steps: float, mean: float) -> None:
+    for kind, expected in (("rate", True), ("angle", False)):
+        reduced = on_lattice(kind, steps, mean=mean)
+        np.testing.assert_allclose(reduced["lattice"], steps * SCATTER, rtol=1e-6)
+        assert (rounded_rates(reduced, calibrate(reduced)) == expected).all(), kind
+
+
+@pytest.mark.parametrize("kind", ["rate", "angle"])
+def test_fine_steps_are_nobodys(kind: str) -> None:
+    reduced = on_lattice(kind, 0.3)
+    assert (reduced["lattice"] > 0).all()
+    assert not rounded_rates(reduced, calibrate(reduced)).any()
+
+
+def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
+    rng = np.random.default_rng(4)
+    rates = 3.0 + SCATTER * rng.standard_normal((2, 18_001))
+    step = 0.85 * SCATTER
+    smooth = 0.8 * rates[:, 1:] + 0.2 * rates[:, :-1]  # takes more from the highest frequencies than the steps add
+    counted = np.diff(np.floor(np.cumsum(smooth, axis=1) / step), axis=1, prepend=0.0) * step
+    reduced = reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
+    assert (reduced["lattice"] > 0).all()
+    assert not rounded_rates(reduced, calibrate(reduced)).any()
+
+
+def test_axes_tell_together_what_one_tells_not() -> None:
+    reduced = on_lattice("rate", 0.7)
+    baseline = calibrate(reduced)
+    alone = [rounded_rates(reduced.isel(axis=[number]), baseline.isel(axis=[number])) for number in range(2)]
+    assert not np.concatenate(alone).any()
+    assert rounded_rates(reduced, baseline).all()
+
+
+def test_without_a_lattice_nothing_was_rounded() -> None:
+    reduced = on_lattice("rate", 2.0)
+    plain = reduced.assign(lattice=reduced["lattice"] * 0.0)
+    assert not rounded_rates(plain, calibrate(reduced)).any()
+
+
+def test_a_model_does_not_say_what_the_record_is() -> None:
+    model = {"noise": {"N": 0.003, "Q": 0.1}, "log": {"axes": ["x", "y"]}}
+    for kind, expected in (("rate", True), ("angle", False)):
+        reduced = on_lattice(kind, 2.0)
+        assert (rounded_rates(reduced, from_model(reduced, model)) == expected).all()
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.13, 0.5])
+@pytest.mark.parametrize("scatter", [0.1, 0.4, 1.0])
+def test_the_share_of_a_counter_is_that_of_its_errors(mean: float, scatter: float) -> None:
+    steps = mean + scatter * np.random.default_rng(1).standard_normal(400_000)
+    angle = np.cumsum(steps)
+    errors = np.diff(np.rint(angle + 0.37) - angle)
+    assert float(angle_share(np.array([mean]), scatter)[0]) == pytest.approx(np.var(errors) * 6.0, rel=0.02)
+
+
+@pytest.mark.parametrize(("kind", "names"), [("rate", ["rate_quantization"]), ("angle", [])])
+def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
+    reduced = on_lattice(kind, 2.0, size=9_000)
+    baseline, records = nulls(reduced, 40)
+    found = name_effects(reduced, baseline, records)
+    assert [claim.effect for claim in found.claims] == names
+    assert ("lattice" in found.reasons.get("rate_quantization", "")) == (kind == "angle")
+
+
+def cut_record(how, *, step: float = 0.18, mean: tuple[float, float] = (0.3, -0.8), zone: float = 0.0, size: int = 24_000) -> xr.Dataset:
+    """White noise on two axes whose samples stand on a lattice, in scatters of a sample; on x a zone in which it sticks before that."""
+    rates = np.array(mean)[:, None] + np.random.default_rng(3).standard_normal((2, size))
+    rates[0] = np.where(np.abs(rates[0]) < zone * step, 0.0, rates[0])
+    return reduce_log(make_log(how(rates / step) * step * SCATTER, rate=10.0, unit="deg/h", axis=["x", "y"]))
+
+
+@pytest.mark.parametrize("step", [0.05, 0.18, 0.5])
+def test_a_rate_that_is_cut_off_towards_zero_is_told_by_the_cell_of_zero(step: float) -> None:
+    for how, cut in ((np.trunc, True), (np.rint, False), (np.floor, False)):
+        reduced = cut_record(how, step=step)
+        assert (cut_off(reduced) == cut).all()
+        assert (may_be_cut_off(reduced) == cut).all()
+        width, error = reduced["cell_width"].values, reduced["cell_width_stderr"].values
+        assert (np.abs(width - [2.0 if cut else 1.0, 1.0]) < 4.0 * error + 0.15).all()
+        assert rounded_rates(reduced, calibrate(reduced)).all() == cut or step > 0.4
+
+
+@pytest.mark.parametrize("zone", [1.0, 2.0])
+def test_what_sticks_at_zero_is_missing_beside_it(zone: float) -> None:
+    reduced = cut_record(np.rint, zone=zone)
+    width = reduced["cell_width"].sel(axis="x", cell="next")
+    assert abs(float(width) - max(1.5 - zone, 0.0)) < 0.1
+    assert not cut_off(reduced).any()
+    assert not may_be_cut_off(reduced).any()
+
+
+@pytest.mark.parametrize(
+    ("how", "zone", "names"), [(np.trunc, 0.0, ["rate_quantization"]), (np.rint, 1.0, ["dead_zone"]), (np.rint, 0.0, [])]
+)
+def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(how, zone: float, names: list[str]) -> None:
+    reduced = cut_record(how, zone=zone, size=15_000)
+    baseline, records = nulls(reduced, 40)
+    found = name_effects(reduced, baseline, records)
+    assert [claim.effect for claim in found.claims] == names
+    assert all(claim.alternatives == () for claim in found.claims)
+    if names == ["rate_quantization"]:
+        assert {one.effect.mode for one in fit_claims(found, baseline) if one.effect} == {"zero"}
+
+
+def test_where_the_cells_do_not_tell_both_names_stand() -> None:
+    """Three standard deviations away a cell holds three of 15 000 samples: nothing tells whether that of zero is twice as wide."""
+    reduced = cut_record(np.rint, step=0.04, mean=(-3.0, 2.8), zone=0.0, size=15_000)
+    assert may_be_cut_off(reduced).all()
+    assert not cut_off(reduced).any()
+    variant = Variant({}, ("stuck",), np.empty(0))
+    part = Part(Candidate("dead_zone", "marks", (), (variant,)), variant, ("x",), 20.0)
+    state = begin_state(reduced, calibrate(reduced))
+    assert "rate_quantization" in structural("dead_zone", [part], state)
+    told = cut_record(np.rint, zone=1.0, size=15_000)
+    assert "rate_quantization" not in structural("dead_zone", [part], begin_state(told, calibrate(told)))

@@ -1,0 +1,99 @@
+"""Steps of the rate within a block: the power that they have there is theirs, and what is loud elsewhere is not."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import gyrostab
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.known_effects import known_motion, without_known_motion
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.task import Task, still_lines
+from gyrostab.progress import no_stage
+from gyrostab.simulate import simulate
+from tests.support.named import nulls, record
+
+NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
+JUMP = {"name": "bias_jump", "step": [2.0], "at": 807.0}  # 50 standard deviations of a block's mean; blocks begin at 800 s and 820 s
+
+
+def _log(effects, seed):
+    model = {"noise": NOISE, "effect": effects, "log": {"axes": ["x"]}}
+    return simulate(model, duration="30min", rate=10.0, seed=seed).compute()
+
+
+def _diagnosed(log, effects=()):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return gyrostab.diagnose(log, simulation={"noise": NOISE, "effect": list(effects)}, nulls=100)
+
+
+@pytest.fixture(scope="module")
+def jumped():
+    return _log([JUMP], 2)
+
+
+def test_a_jump_within_a_block_explains_the_power_that_it_has_there_and_at_the_lowest_lines(jumped):
+    found = _diagnosed(jumped)
+    assert found.verdict == "explained"
+    assert [effect["name"] for effect in found.effects] == ["bias_jump"]
+    assert {"davar", "spectrum", "mean"} <= {box["view"] for box in found.content["mismatches"]}
+    assert {name for box in found.content["mismatches"] for name in box["explained_by"]} == {"bias_jump"}
+
+
+def test_what_is_loud_in_other_blocks_is_not_the_jump(jumped):
+    seconds = np.arange(jumped.sizes["time"]) / 10.0
+    rate = jumped["rate"].transpose("axis", "time").values.copy()
+    rate[:, (seconds >= 1200) & (seconds < 1300)] *= 1.4
+    found = _diagnosed(jumped.assign(rate=(("axis", "time"), rate, jumped["rate"].attrs)))
+    left = [box for box in found.content["mismatches"] if not box["explained_by"]]
+    assert found.verdict == "partly explained"
+    start = np.datetime64(found.content["recording"]["start"].removesuffix("Z"))
+    spans = [[(np.datetime64(box[end].removesuffix("Z")) - start) / np.timedelta64(1, "s") for end in ("start", "end")] for box in left]
+    assert any(begin < 1300 and end > 1200 for begin, end in spans)
+
+
+def test_hops_between_two_levels_leave_no_line_against_their_own_model():
+    hops = {"name": "telegraph", "step": [1.0], "low": 200.0, "high": 200.0}
+    found = _diagnosed(_log([hops], 7), [hops])
+    assert (found.verdict, found.content["mismatches"]) == ("no mismatch", [])
+    assert {one["name"] for one in found.content["baseline"]["expected"]} == {"telegraph"}
+
+
+def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
+    """The core reads the log again for its lines; what is loud in blocks that are left out does not matter then."""
+    task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
+    reduced = reduce_log(jumped)
+    baseline = calibrate(reduced)
+    course = np.zeros((1, reduced.sizes["block"]))
+    course[:, :12:2] = 5.0  # the first part has the blocks 0 to 11
+    known = baseline.assign(known_mean=(("axis", "block"), course))
+    found = still_lines(task, reduced, known)
+    assert found["line_weight"].values[0, 0] == 0.0
+    np.testing.assert_allclose(found["line_power"][:, 2:], reduced["line_power"][:, 2:])
+    xr.testing.assert_identical(found.drop_vars(["line_power", "line_weight"]), reduced.drop_vars(["line_power", "line_weight"]))
+    assert still_lines(task, reduced, baseline) is reduced
+
+
+def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_else():
+    reduced = record([])
+    baseline, _ = nulls(reduced, 4)
+    step = np.zeros((3, reduced.sizes["block"]))
+    step[1, 90:] = 1.0
+    known = baseline.assign(known_mean=(("axis", "block"), step))
+    moving = known_motion(reduced, known)
+    assert np.argwhere(moving).tolist() == [[1, 89], [1, 90]]
+    out = without_known_motion(reduced, known)
+    for name in ("power", "kurtosis"):
+        lost = out[name].isnull() & reduced[name].notnull()
+        lost = lost.any("band") if "band" in lost.dims else lost
+        np.testing.assert_array_equal(lost.transpose("axis", "block"), moving)
+    lost = (out["cross"].isnull() & reduced["cross"].notnull()).any("band").transpose("pair", "block").values
+    touched = ["y" in pair for pair in zip(reduced["first"].values, reduced["second"].values, strict=True)]
+    np.testing.assert_array_equal(lost, np.outer(touched, moving[1]))
+    xr.testing.assert_identical(out["mean"], reduced["mean"])
+    assert without_known_motion(reduced, baseline) is reduced

@@ -1,0 +1,224 @@
+"""Samples that stand still: at zero, at the ends of the range, or wherever the rate was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.estimate.outlier_power import with_odd_power
+from gyrostab.diagnose.estimate.recalibrate import recalibrate
+from gyrostab.diagnose.identify.forward_search import Naming, name_effects
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result import finish as conclude
+from gyrostab.ingest.make_log import make_log
+from gyrostab.physics.registry import make_effect
+from tests.support.effect_bench import run
+from tests.support.named import nulls
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCATTER = 0.5  # deg/h, of a sample
+
+
+def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -> Naming:
+    noise = mean + SCATTER * np.random.default_rng(seed).standard_normal((len(axes), 15_000))
+    effect = make_effect(table)
+    on = [axes.index(axis) for axis in effect.axes or axes]
+    noise[on] = run(effect, size=noise.shape[1], axes=axes, signal=noise[on], seed=seed)
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list(axes)))
+    baseline, records = nulls(reduced, 40)
+    return name_effects(reduced, baseline, records)
+
+
+@pytest.mark.parametrize(
+    ("table", "options"),
+    [
+        ({"name": "dead_zone", "width": 0.002, "axes": ["x"]}, {}),
+        ({"name": "dead_zone", "width": 0.2, "edge": "jump"}, {}),
+        ({"name": "dead_zone", "width": 0.2, "edge": "jump", "axes": ["x"]}, {"axes": "x"}),
+        ({"name": "held_samples", "per_hour": 60.0, "length": 0.4}, {}),
+        ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {}),
+        ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {"axes": "x"}),
+        ({"name": "clipping", "limit": 0.6, "axes": ["y"]}, {}),
+        ({"name": "clipping", "limit": 1.75, "axes": ["y"]}, {}),  # seven samples of 15 000
+    ],
+    ids=lambda value: "-".join(map(str, value.values())),
+)
+def test_it_is_told_where_they_stand(table, options):
+    found = named(table, **options)
+    (claim,) = found.claims
+    assert claim.effect == table["name"]
+    assert claim.axes == tuple(table.get("axes", options.get("axes", "xyz")))
+    alone = table["name"] == "dead_zone" and options
+    assert claim.alternatives == (("held_samples",) if alone else ())
+    if table["name"] == "held_samples":
+        (fitted,) = fit_claims(found, calibrate(found.state.reduced))[:1]
+        assert fitted.effect is not None
+        assert fitted.effect.fill == table.get("fill", "repeat")
+
+
+def test_a_pulse_that_comes_again_and_again_is_lines_and_no_spikes():
+    noise = SCATTER * np.random.default_rng(6).standard_normal((2, 15_000))
+    noise[0, ::37] += 8.0 * SCATTER
+    noise[1, np.random.default_rng(7).choice(15_000, 40, replace=False)] += 12.0 * SCATTER
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]))
+    baseline, records = nulls(reduced, 40)
+    found = {claim.effect: claim.axes for claim in name_effects(reduced, baseline, records).claims}
+    assert found["spectral_line"] == ("x",)
+    assert found["spikes"] == ("y",)
+
+
+def on_a_lattice(held: int, *, seed: int = 21, size: int = 15_000) -> xr.Dataset:
+    """Three axes on a lattice of a seventh of their scatter, on which one sample in twenty is zero; z is lost in the second half.
+
+    `held` stretches of six samples are filled with zeros.
+    """
+    rng = np.random.default_rng(seed)
+    noise = SCATTER * (rng.standard_normal((3, size)) + np.array([[0.3], [-0.4], [0.2]]))
+    noise = np.rint(noise / 0.07) * 0.07
+    for first in rng.choice(np.arange(50, size - 100, 30), held, replace=False):
+        noise[:, first : first + 6] = 0.0
+    noise[2, size // 2 :] = np.nan
+    noise[1, rng.random(size) < 0.1] = np.nan
+    return reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+
+
+def test_zeros_of_a_lattice_are_expected_together_where_an_axis_is_lost():
+    reduced = on_a_lattice(0)
+    zeros, samples = (reduced[name].sum("block").values for name in ("zeros", "samples"))
+    assert (zeros / samples > 0.04).all()
+    lost = reduced["begin"].values > 800.0
+    baseline, records = nulls(reduced, 40)
+    found = name_effects(reduced, baseline, records)
+    assert found.claims == ()
+    drawn = records[0]["filled"].mean("record").values[:, lost].mean(axis=1)
+    np.testing.assert_allclose(drawn[:2], reduced["filled"].values[:2, lost].mean(axis=1), atol=0.12)
+
+
+def test_samples_that_were_filled_with_zeros_are_seen_where_an_axis_is_lost():
+    reduced = on_a_lattice(20)
+    baseline, records = nulls(reduced, 40)
+    (claim,) = name_effects(reduced, baseline, records).claims
+    assert (claim.effect, claim.axes) == ("held_samples", ("x", "y", "z"))
+    assert all(part.variant.columns == ("filled",) for part in claim.parts)
+    assert float(reduced["filled"].sel(axis="x").sum()) == pytest.approx(120, abs=25)
+
+
+def test_an_axis_that_is_lost_early_keeps_blocks_where_all_that_are_left_have_odd_samples():
+    """Of 92 blocks z has 20, with zeros in each: without them nothing would be left of it."""
+    rng = np.random.default_rng(104)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    noise[2, 3_240:] = np.nan
+    for first in range(100, 3_240, 162):
+        noise[:, first : first + 6] = 0.0
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    assert (reduced["filled"].sel(axis="z") > 0).sum() == np.isfinite(reduced["mean"].sel(axis="z")).sum() == 20
+    baseline, records = nulls(reduced, 40)
+    (claim,) = name_effects(reduced, baseline, records).claims
+    assert (claim.effect, claim.axes) == ("held_samples", ("x", "y", "z"))
+
+
+@pytest.mark.parametrize("fill", ["repeat", "zero"])
+def test_how_often_and_how_long_samples_were_held_is_told(fill):
+    """Held stretches drawn here, 40 of 6 samples each and 20 of 2."""
+    rng = np.random.default_rng(8)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    for number, first in enumerate(np.sort(rng.choice(np.arange(50, 14_900, 30), 60, replace=False))):
+        length = 6 if number < 40 else 2
+        noise[:, first : first + length] = noise[:, first - 1 : first] if fill == "repeat" else 0.0
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(reduced, 40)
+    found = fit_claims(name_effects(reduced, baseline, records), baseline)
+    assert [one.axes for one in found] == [("x",), ("y",), ("z",)]
+    hours = float(reduced["samples"].sel(axis="x").sum()) / 36_000.0
+    for one in found:
+        assert one.parameters["per_hour"].value == pytest.approx(60 / hours, rel=0.06)
+        assert one.parameters["length"].value == pytest.approx((40 * 6 + 20 * 2) / 60 / 10.0, rel=0.06)
+        for name, true in (("per_hour", 60 / hours), ("length", 0.467)):
+            assert one.parameters[name].low < true < one.parameters[name].high
+
+
+def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
+    rng = np.random.default_rng(4)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    places = 6_000 + 3 * np.arange(14)
+    flips = rng.choice([-1.0, 1.0], 14) * 2.0 ** rng.integers(3, 7, 14)
+    noise[1, places] += flips
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(reduced, 40)
+    (claim,) = (found := name_effects(reduced, baseline, records)).claims
+    assert (claim.effect, claim.axes) == ("spikes", ("y",))
+    (fitted,) = fit_claims(found, baseline)
+    assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0
+
+
+def test_noise_that_rises_within_a_block_is_no_outlier_beside_spikes_of_another_axis():
+    rng = np.random.default_rng(6)
+    shaken = (np.arange(15_000) >= 31 * 162 + 120) & (np.arange(15_000) < 62 * 162 + 40)  # ends in the quiet half of a block
+    noise = SCATTER * rng.standard_normal((3, 15_000)) * np.where(shaken, 8.0, 1.0)
+    noise[1, rng.choice(4_000, 12, replace=False)] += 30.0
+    log = make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz"), channels={"vibration": (3.0 * shaken, "g")})
+    baseline, records = nulls(reduce_log(log), 40)
+    axes = {claim.effect: claim.axes for claim in name_effects(reduce_log(log), baseline, records).claims}
+    assert axes.pop("spikes") == ("y",)
+    assert list(axes.values()) == [("x", "y", "z")]  # of what vibration does
+
+
+def test_noise_that_rises_and_falls_has_no_spikes():
+    rng = np.random.default_rng(100)
+    for edge in (40, 81, 120):
+        shaken = (np.arange(15_000) >= 31 * 162 + edge) & (np.arange(15_000) < 62 * 162 + edge)
+        noise = SCATTER * rng.standard_normal((2, 15_000)) * np.where(shaken, 5.0, 1.0)
+        assert int(reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xy")))["outliers"].sum()) <= 1
+
+
+def test_spikes_of_six_deviations_are_named_and_counted():
+    rng = np.random.default_rng(8)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    noise[1, rng.choice(15_000, 20, replace=False)] += 6.0 * SCATTER * rng.choice([-1.0, 1.0], 20)
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(reduced, 40)
+    (claim,) = (found := name_effects(reduced, baseline, records)).claims
+    assert (claim.effect, claim.axes) == ("spikes", ("y",))
+    (fitted,) = fit_claims(found, baseline)
+    number = fitted.parameters["per_hour"].value * 15_000 / 36_000
+    assert 10 < number < 40
+    assert 0.5 < fitted.parameters["size"].value / (6.0 * SCATTER) < 2.0
+
+
+def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_powers_of_the_model():
+    rng = np.random.default_rng(11)
+    hit = rng.random((1, 15_000)) < 0.009
+    noise = SCATTER * (rng.standard_normal((1, 15_000)) + 70.0 * rng.standard_normal((1, 15_000)) * hit)
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
+    assert (reduced["peaks"] > 0).mean() > 0.6
+    baseline, records = nulls(reduced, 40)
+    (fitted,) = fit_claims(found := name_effects(reduced, baseline, records), baseline)
+    size, number = fitted.parameters["size"], fitted.parameters["per_hour"]
+    assert size.low < 70.0 * SCATTER < size.high
+    assert number.low < 0.009 * 36_000 < number.high
+    clean = predicted(found, recalibrate(found, baseline, [fitted]))
+    whole = with_odd_power(clean, reduced, [fitted])["spectrum"].mean()
+    assert float(whole) == pytest.approx(float(reduced["power"].mean()), rel=0.4)
+    assert float(clean["spectrum"].mean()) < 0.1 * float(whole)
+    for lacking, known in (([fitted], []), ([], [fitted])):  # effects of the recording alone, or of the simulation too
+        surfaces = conclude._surfaces(reduced, conclude.Fit(found, clean, lacking, known), clean, clean)
+        short = surfaces["avar"].isel(tau=0).mean(["axis", "window"])
+        before, after = (float(short.sel(case=case) / short.sel(case="recording")) for case in ("before", "after"))
+        assert after == pytest.approx(1.0, rel=0.4)
+        assert before == pytest.approx(1.0, rel=0.4) if known else before < 0.1
+
+
+def test_bursts_of_noise_shorter_than_a_block_have_no_spikes():
+    rng = np.random.default_rng(9)
+    loud = np.ones(15_000)
+    for first in rng.integers(0, 14_900, 10):
+        loud[first : first + 40] = 8.0
+    noise = SCATTER * loud * rng.standard_normal((3, 15_000))
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(reduced, 40)
+    assert "spikes" not in [claim.effect for claim in name_effects(reduced, baseline, records).claims]

@@ -1,0 +1,113 @@
+"""Intervals hold the truth where a response is slow and bent, or quicker than any value that naming tries."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.estimate.upper_limits import limits
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.predict.condition import explain_away
+from gyrostab.diagnose.predict.linear_model import begin_state
+from tests.diagnose.estimate.test_joint_fit import claimed
+from tests.support.named import WORLD, record
+
+RECORDS, SECONDS, BLOCK = 20, 3600, 20
+VOLTS = [[0, 28.0], [600, 27.0], [1300, 28.2], [2100, 26.8], [2900, 27.9]]
+HEAT = [[0, 30], [400, 30], [1000, 36], [1600, 36], [2200, 31], [2800, 31], [3300, 35], [3600, 35]]
+
+
+def in_blocks(seconds: np.ndarray) -> xr.DataArray:
+    """Block means of what has one value a second."""
+    return xr.DataArray(seconds.reshape(-1, BLOCK).mean(axis=1), dims="block")
+
+
+def slow(values: np.ndarray, time: float) -> np.ndarray:
+    """What follows values of every second with a time constant, second by second."""
+    out = np.empty_like(values)
+    out[0] = values[0]
+    for place in range(1, values.size):
+        out[place] = out[place - 1] + (values[place - 1] - out[place - 1]) * -np.expm1(-1.0 / time)
+    return out
+
+
+def fits(environment: tuple[dict[str, Any], ...], effect: str, column: str, shape: np.ndarray) -> list[dict[str, Any]]:
+    """Numbers of an effect in records of noise to which its mean, of one value a second, is added."""
+    reduced = record([], environment=environment)
+    baseline = calibrate(reduced)
+    frame = claimed(reduced, baseline, effect, "mean", (column,))
+    drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
+    out = []
+    for number in range(RECORDS):
+        mean = drawn["mean"].isel(record=number).transpose("axis", "block") + in_blocks(shape)
+        state = explain_away(begin_state(reduced.assign(mean=mean), baseline), list(frame.claims[0].parts))
+        out.append(dict(fit_claims(replace(frame, state=state), baseline)[0].parameters))
+    return out
+
+
+def held(found: list[dict[str, Any]], name: str, truth: float) -> float:
+    return float(np.mean([one[name].low <= truth <= one[name].high for one in found]))
+
+
+def half_width(found: list[dict[str, Any]], name: str) -> float:
+    return float(np.median([0.5 * (one[name].high - one[name].low) for one in found]))
+
+
+def test_of_a_slow_and_bent_response_to_the_supply_the_sensitivity_at_rest_and_the_lag_are_held():
+    time, size = 45.0, 0.12
+    second = np.arange(SECONDS)
+    volt = np.array([level for _, level in VOLTS])[np.searchsorted([at for at, _ in VOLTS], second, side="right") - 1]
+    above = volt - volt.mean()
+    bent = above - 0.3 * np.minimum(above, 0.0) ** 2
+    at_rest = size * np.polyfit(above, bent, 1)[0]
+    environment = (*WORLD["usual"], {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": VOLTS})
+    found = fits(environment, "supply_bias", "voltage", size * slow(bent, time))
+    assert 0.9 <= held(found, "voltage", at_rest) <= 1.0
+    assert 0.9 <= held(found, "lag", time) <= 1.0
+    assert half_width(found, "voltage") < 0.25 * at_rest
+    assert half_width(found, "lag") < 0.5 * time
+
+
+def test_a_warm_up_that_is_quicker_than_those_of_the_grid_is_held():
+    time, size = 25.0, 1.0
+    found = fits(WORLD["usual"], "warm_up", "amplitude", size * np.exp(-(np.arange(SECONDS) + 0.5) / time))
+    assert 0.9 <= held(found, "amplitude", size) <= 1.0
+    assert 0.9 <= held(found, "time", time) <= 1.0
+    assert half_width(found, "time") < 0.6 * time
+
+
+def test_a_play_between_those_of_the_grid_is_held():
+    width, size = 0.9, 0.15
+    heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
+    slider = np.empty_like(heat)
+    last = heat[0]
+    for place, value in enumerate(heat):
+        slider[place] = last = min(max(last, value - width), value + width)
+    environment = ({"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT}, WORLD["usual"][1])
+    found = fits(environment, "thermal_hysteresis", "sensitivity", size * (heat - slider))
+    assert 0.9 <= held(found, "sensitivity", size) <= 1.0
+    assert 0.9 <= held(found, "width", width) <= 1.0
+    assert half_width(found, "sensitivity") < 0.4 * size
+
+
+def test_what_is_there_but_slower_than_others_is_below_its_limit():
+    size, time = 0.25, 700.0
+    heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
+    environment = ({"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT}, WORLD["usual"][1])
+    reduced = record([], environment=environment)
+    baseline = calibrate(reduced)
+    frame = claimed(reduced, baseline, "shupe", "mean", ("sensitivity",))
+    frame = replace(frame, claims=(), candidates=tuple(one for one in frame.candidates if one.effect == "shupe"))
+    drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
+    there = in_blocks(size * slow(60.0 * np.gradient(heat), time))
+    found = []
+    for number in range(RECORDS):
+        seen = reduced.assign(mean=drawn["mean"].isel(record=number).transpose("axis", "block") + there)
+        found.append(limits(replace(frame, state=begin_state(seen, baseline)))["shupe"].upper_limit)
+    assert np.mean(np.array(found) >= size) >= 0.9
+    assert np.median(found) < 4.0 * size

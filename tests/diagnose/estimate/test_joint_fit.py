@@ -1,0 +1,230 @@
+"""Sizes of named effects: unbiased, with intervals that hold the truth, also where the form is only nearly right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, fit_claims
+from gyrostab.diagnose.estimate.upper_limits import limits
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.forward_search import Claim, Naming, name_effects
+from gyrostab.diagnose.identify.sample_sizes import line_size
+from gyrostab.diagnose.nulls.records import null_records
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.simulate import simulate
+from tests.support.named import COEFFICIENT, nulls, record
+
+RECORDS = 60
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    reduced = record([])
+    return reduced, calibrate(reduced)
+
+
+def claimed(reduced: xr.Dataset, baseline: xr.Dataset, effect: str, view: str, columns: tuple[str, ...]) -> Naming:
+    """A naming of one effect on the first axis."""
+    candidates, reasons = effect_candidates(reduced, COEFFICIENT)
+    one = next(one for one in candidates if one.effect == effect and one.view == view)
+    variant = next(variant for variant in one.variants if variant.columns == columns)
+    part = Part(one, variant, ("x",), 50.0)
+    claim = Claim(effect, one.driver, ("x",), (part,), 50.0, 8.0)
+    state = explain_away(begin_state(reduced, baseline), [part])
+    return Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced))
+
+
+def fits(quiet, change, effect, view, columns):
+    """Fits of many records of noise to which `change` adds an effect."""
+    reduced, baseline = quiet
+    drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
+    out = []
+    frame = claimed(reduced, baseline, effect, view, columns)
+    for number in range(RECORDS):
+        one = reduced.assign(
+            mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
+            power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
+        )
+        state = explain_away(begin_state(change(one), baseline), list(frame.claims[0].parts))
+        (fitted,) = fit_claims(replace(frame, state=state), baseline)
+        out.append(fitted.parameters[columns[0]])
+    return out
+
+
+def coverage(estimates, truth: float) -> float:
+    return float(np.mean([one.low <= truth <= one.high for one in estimates]))
+
+
+@pytest.mark.parametrize(("size", "power"), [(0.1, 2.0), (0.5, 2.0), (0.5, 1.9)])
+def test_intervals_of_rectification_hold_the_truth(quiet, size, power):
+    g = quiet[0]["channel_vibration"].values
+    truth = size / 36.0
+
+    def change(one):
+        return one.assign(mean=one["mean"] + xr.DataArray(size * (g / 6.0) ** power, dims="block"))
+
+    found = fits(quiet, change, "vibration_rectification", "mean", ("sensitivity",))
+    assert 0.90 <= coverage(found, truth) <= 1.0
+    assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=FORM_ERROR)
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_intervals_of_vibration_noise_hold_the_truth(quiet, share):
+    g = quiet[0]["channel_vibration"].values
+    truth = 0.003 * np.sqrt(share) / 6.0
+
+    def change(one):
+        return one.assign(power=one["power"] * xr.DataArray(1.0 + share * (g / 6.0) ** 2, dims="block"))
+
+    found = fits(quiet, change, "vibration_noise", "power", ("white",))
+    assert 0.88 <= coverage(found, truth) <= 1.0
+    assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=0.06)
+
+
+@pytest.mark.parametrize(("levels", "both"), [((5.0, 5.0), False), ((3.0, 8.0), True)])
+def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
+    reduced, baseline = quiet
+    place = np.linspace(0.0, 1.0, reduced.sizes["block"])
+    g = np.where((place > 0.2) & (place < 0.4), levels[0], np.where((place > 0.6) & (place < 0.8), levels[1], 0.0))
+    g = g + 0.05 * np.random.default_rng(3).random(g.size)
+    sensitivity, quartic = (0.05, -5e-4) if both else (0.005, 0.0)
+    shape = xr.DataArray(sensitivity * g**2 + quartic * g**4, dims="block")
+    drawn = next(iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1)))
+    one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
+    one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
+    frame = claimed(one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic"))
+    (fitted,) = fit_claims(frame, baseline)
+    assert set(fitted.parameters) == ({"sensitivity", "quartic"} if both else {"sensitivity"})
+    assert ("does not tell" in fitted.say()) is not both
+    for name, truth in (("sensitivity", sensitivity), ("quartic", quartic)):
+        if name in fitted.parameters:
+            assert fitted.parameters[name].low < truth < fitted.parameters[name].high
+
+
+@pytest.mark.parametrize("column", ["sensitivity", "quartic"])
+@pytest.mark.parametrize("levels", [(5.0, 5.0), (3.0, 8.0)])
+def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_from_it(quiet, levels, column):
+    reduced, baseline = quiet
+    place = np.linspace(0.0, 1.0, reduced.sizes["block"])
+    g = np.where((place > 0.2) & (place < 0.4), levels[0], np.where((place > 0.6) & (place < 0.8), levels[1], 0.0))
+    drawn = next(iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1)))
+    shape = xr.DataArray(0.005 * g**2 if column == "sensitivity" else 1e-4 * g**4, dims="block")
+    one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
+    one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
+    (fitted,) = fit_claims(claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline)
+    alike = levels[0] == levels[1]
+    assert set(fitted.parameters) == ({"sensitivity"} if alike else {column})
+    assert ("does not tell" in fitted.say()) is alike
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    reduced = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])
+    baseline, records = nulls(reduced)
+    return name_effects(reduced, baseline, records), baseline
+
+
+def test_the_model_has_the_effect(shaken):
+    naming, baseline = shaken
+    (fitted,) = fit_claims(naming, baseline)
+    one = fitted.parameters["sensitivity"]
+    assert one.low < 0.005 < one.high
+    assert one.unit == "deg/h/g^2"
+    assert fitted.effect is not None
+    assert fitted.effect.axes == ("y",)
+    assert "rectified" in fitted.say()
+    table = {"name": fitted.effect.name, "sensitivity": fitted.effect.sensitivity, "axes": list(fitted.effect.axes)}
+    again = record([table])["mean"].sel(axis="y") - record([])["mean"].sel(axis="y")
+    truth = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])["mean"].sel(axis="y") - record([])[
+        "mean"
+    ].sel(axis="y")
+    np.testing.assert_allclose(again, truth, atol=0.25 * float(np.abs(truth).max()))
+
+
+def test_the_prediction_fits_only_what_it_may_see(shaken):
+    naming, baseline = shaken
+    after = predicted(naming, baseline)
+    vibration = naming.state.reduced["channel_vibration"].values
+    gained = (after["known_mean"] - baseline["known_mean"]).sel(axis="y").values
+    assert np.ptp(gained) == pytest.approx(0.005 * np.max(vibration**2), rel=0.35)
+    assert np.allclose((after["known_mean"] - baseline["known_mean"]).sel(axis="x"), 0.0)
+    blind = predicted(naming, baseline, vibration < 1.0)
+    changed = replace(naming, state=replace(naming.state, reduced=naming.state.reduced.assign(
+        mean=naming.state.reduced["mean"] + xr.DataArray(np.where(vibration < 1.0, 0.0, 5.0), dims="block")
+    )))  # fmt: skip
+    np.testing.assert_allclose(predicted(changed, baseline, vibration < 1.0)["known_mean"], blind["known_mean"])
+
+
+def test_what_was_not_found_has_a_limit_or_a_reason(shaken):
+    naming, _ = shaken
+    found = limits(naming)
+    assert "vibration_rectification" not in found
+    assert found["shupe"].reason == "below limit"
+    assert 0.0 < found["shupe"].upper_limit < 5.0
+    assert found["shupe"].unit == "deg/h/(degC/min)"
+    assert 0.0 < found["vibration_noise"].upper_limit < 1e-3
+    assert np.isnan(found["feedback_reset"].upper_limit)
+    assert found["feedback_reset"].reason.startswith("not identifiable")
+
+
+def test_size_of_a_line():
+    table = {"name": "spectral_line", "amplitude": 0.4, "frequency": 2.345, "axes": ["x"]}
+    reduced = record([table])
+    power = reduced["line_power"].sel(axis="x").mean("part")
+    place = int(power.values.argmax())
+    (amplitude, error), (frequency, _) = line_size(reduced, "x", place)
+    assert amplitude == pytest.approx(0.4, abs=max(4 * error, 0.04))
+    assert frequency == pytest.approx(2.345, abs=0.03)
+
+
+def test_where_a_line_is_is_known_to_a_step_of_its_spectrum():
+    true = 4.013
+    reduced = record([{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}])
+    baseline = calibrate(reduced)
+    naming = claimed(reduced, baseline, "spectral_line", "line", ("amplitude",))
+    place = int(reduced["line_power"].sel(axis="x").mean("part").values.argmax())
+    part = replace(naming.claims[0].parts[0], place=place)
+    (fitted,) = fit_claims(replace(naming, claims=(replace(naming.claims[0], parts=(part,)),)), baseline)
+    found = fitted.parameters["frequency"]
+    step = float(np.diff(reduced["line_frequency"].values[:2])[0])
+    assert found.low < true < found.high
+    assert found.high - found.low < 2.0 * step
+
+
+def test_simulation_of_named_effects_runs(shaken):
+    naming, baseline = shaken
+    (fitted,) = fit_claims(naming, baseline)
+    values = {item.name: getattr(fitted.effect, item.name) for item in fitted.effect.parameters()}
+    log = simulate(
+        {"noise": {"N": 0.003}, "effect": [{"name": fitted.effect.name, "axes": ["y"], **values}],
+         "environment": [{"profile": "vibration", "points": [[0, 0.0], [30, 6.0]]}], "log": {"axes": ["x", "y"]}},
+        duration="1min", rate=10.0,
+    )  # fmt: skip
+    assert np.isfinite(log["rate"].values).all()
+
+
+def test_axes_that_the_strongest_view_lacks_have_their_sizes_from_the_next():
+    """Two axes are named by what they share, the third by its power alone: its size is no nought."""
+    world = [{"profile": "vibration", "points": [[0, 0.02], [600, 0.02], [601, 6.0], [1200, 6.0], [1201, 0.02], [3600, 0.02]]}]
+    truth = {"x": 0.2, "y": 0.3, "z": 0.1}
+    effect = {"name": "aliased_vibration", "low": 700.0, "high": 800.0, "sensitivity": list(truth.values()), "axes": list(truth)}
+    reduced = record([effect], environment=world)
+    baseline = calibrate(reduced)
+    candidates, reasons = effect_candidates(reduced, baseline["coefficient"])
+    power, cross = (next(one for one in candidates if (one.effect, one.view) == (effect["name"], view)) for view in ("power", "cross"))
+    parts = [Part(cross, cross.variants[0], ("x", "y"), 90.0), *(Part(power, power.variants[0], (axis,), 40.0) for axis in "yz")]
+    claim = Claim(effect["name"], power.driver, tuple(truth), tuple(parts), 130.0, 8.0)
+    state = explain_away(begin_state(reduced, baseline), parts)
+    (fitted,) = fit_claims(Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)), baseline)
+    assert fitted.effect.sensitivity == pytest.approx(tuple(fitted.parameters[f"sensitivity.{axis}"].value for axis in truth))
+    for axis, size in truth.items():
+        one = fitted.parameters[f"sensitivity.{axis}"]
+        assert one.low - one.stderr < size < one.high + one.stderr

@@ -1,0 +1,187 @@
+"""Lines: found where they stand out on both sides and all the time, each a claim of its own, by the plainest name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.spectral_lines import line_gains, line_skirt
+from gyrostab.diagnose.identify.components import by_key, without_lines
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identification import Claim, form_error, with_claim
+from gyrostab.diagnose.identify.sample_sizes import line_size
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.designs import Candidate, Variant
+from gyrostab.diagnose.predict.filter_response import straightened
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains, of_means
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.ingest.make_log import make_log
+from tests.support.named import nulls
+
+WEIGHT = np.full((1, 8), 22.0)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def spectra(density: np.ndarray, *, records: int = 20, seed: int = 1) -> np.ndarray:
+    """Mean periodograms of noise with a density (part or 1, line), (record, 1, part, line)."""
+    shape = (records, 1, 8, density.shape[-1])
+    return np.random.default_rng(seed).gamma(22.0, 1.0 / 22.0, shape) * density
+
+
+def test_slopes_and_humps_are_no_lines() -> None:
+    place = np.arange(1.0, 601.0)
+    for density in (place**-2.0, place**2.0, 1.0 + 50.0 * np.exp(-(((place - 90.0) / 15.0) ** 2))):
+        gain = line_gains(spectra(density[None]), WEIGHT)
+        assert gain.max(axis=-1).max() < 8.0  # of 12 000 lines
+
+
+def test_what_comes_and_goes_is_no_steady_line() -> None:
+    once = np.ones((8, 400))
+    once[3, 200] = 40.0
+    assert line_gains(spectra(once), WEIGHT)[..., 200].max() < 0.0
+
+
+def test_a_line_under_a_level_that_changes_is_found_by_its_own_power() -> None:
+    level = np.array([1, 1, 1, 50, 50, 1, 1, 1.0])[:, None] * np.ones(400)
+    level[:, 200] += 2.0
+    found = line_gains(spectra(level), WEIGHT)[:, 0]
+    assert (found.argmax(axis=-1) == 200).all()
+    assert found.max(axis=-1).min() > 20.0
+
+
+def sines(amplitudes: dict[float, float], *, wander: float = 0.0, size: int = 18_000, axes: int = 2) -> xr.Dataset:
+    """White noise of 0.57 deg/h with sines on the first axis, the phase of which wanders by so many radians."""
+    rng = np.random.default_rng(2)
+    t = np.arange(size) / 10.0
+    rates = 0.57 * rng.standard_normal((axes, size))
+    for frequency, amplitude in amplitudes.items():
+        phase = np.cumsum(rng.normal(0.0, wander / np.sqrt(size), size))
+        rates[0] += amplitude * np.sin(2.0 * np.pi * frequency * t + phase)
+    return reduce_log(make_log(rates, rate=10.0, unit="deg/h"))
+
+
+@pytest.mark.parametrize("wander", [0.0, 30.0])
+def test_the_skirt_holds_the_line_and_no_other(wander: float) -> None:
+    reduced = sines({1.0: 3.0, 3.1: 1.0}, wander=wander)
+    lines = reduced["line_frequency"].values
+    place = int(np.abs(lines - 1.0).argmin())
+    skirt = line_skirt(reduced, "x", place)
+    assert skirt[place]
+    assert (np.abs(lines[skirt] - 1.0) < 1.5).all()
+    (amplitude, error), (frequency, _) = line_size(reduced, "x", place)
+    assert amplitude == pytest.approx(3.0, abs=max(4.0 * error, 0.15))
+    assert frequency == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.fixture(scope="module")
+def lines() -> tuple[Claim, ...]:
+    reduced = sines({0.7: 0.25, 2.03: 0.15, 4.06: 0.2}, size=12_000)
+    baseline, records = nulls(reduced, 40)
+    return name_effects(reduced, baseline, records).claims
+
+
+def test_each_line_is_a_claim_of_its_own(lines: tuple[Claim, ...]) -> None:
+    assert [claim.effect for claim in lines] == ["spectral_line"] * 3
+    assert all(claim.axes == ("x",) for claim in lines)
+    assert all(len({part.place for part in claim.parts}) == 1 for claim in lines)
+    assert len({claim.parts[0].place for claim in lines}) == 3
+    assert all({"real_motion", "supply_bias", "feedback_reset"} <= set(claim.alternatives) for claim in lines)  # three may be a comb
+
+
+def test_a_line_changes_no_gain_of_the_means() -> None:
+    reduced = sines({0.7: 0.4}, size=9_000, axes=1)
+    state, folds = begin_state(reduced, calibrate(reduced)), fold_blocks(reduced)
+    candidates, _ = effect_candidates(reduced, state.baseline["coefficient"])
+    found = gains(candidates, reduced, state, folds)
+    line, jump = (by_key(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
+    assert line.gain > 10.0
+    named = explain_away(state, [line])
+    kept = of_means(found, state, named)
+    assert {one.candidate.view for one in kept} == {"mean", "levels"}
+    again = gains([one.candidate for one in kept], named.reduced, named, folds)
+    for one, other in zip(kept, again, strict=True):
+        np.testing.assert_array_equal(one.gain, other.gain)
+    assert not of_means(found, state, explain_away(state, [jump]))
+    lost = replace(state, reduced=reduced.assign(mean=reduced["mean"].where(reduced["begin"] > 0.0)))
+    assert not of_means(found, state, lost)
+
+
+# ------------------------------------------------------------------------------------------------------------ bookkeeping
+
+
+def part(effect: str, view: str, gain: float, place: int = -1) -> Part:
+    variant = Variant({}, ("size",), np.empty(0))
+    return Part(Candidate(effect, view, (), (variant,)), variant, ("x",), gain, place)
+
+
+def claim(one: Part) -> Claim:
+    return Claim(one.candidate.effect, (), one.row, (one,), one.gain, 7.0)
+
+
+def test_a_line_counts_for_the_plainest_name_only() -> None:
+    found = {
+        "spectral_line": [part("spectral_line", "line", 50.0)],
+        "supply_bias(supply)": [part("supply_bias", "line", 50.0), part("supply_bias", "mean", 9.0)],
+        "real_motion": [part("real_motion", "line", 50.0)],
+    }
+    kept = without_lines(found)
+    assert kept["spectral_line"] == found["spectral_line"]
+    assert [one.candidate.view for one in kept["supply_bias(supply)"]] == ["mean"]
+    assert "real_motion" not in kept
+
+
+def test_claims_of_one_effect_become_one_but_for_lines_of_other_frequencies() -> None:
+    first = claim(part("spectral_line", "line", 50.0, 3))
+    assert len(with_claim([first], claim(part("spectral_line", "line", 20.0, 9)))) == 2
+    (both,) = with_claim([first], replace(claim(part("spectral_line", "line", 20.0, 3)), axes=("y",)))
+    assert (both.axes, both.gain) == (("x", "y"), 70.0)
+    assert len(with_claim([claim(part("shupe", "mean", 9.0))], claim(part("shupe", "mean", 8.0)))) == 1
+
+
+def test_a_steady_line_leaves_no_error_of_its_form() -> None:
+    chosen = [claim(part("spectral_line", "line", 900.0, 3)), claim(part("shupe", "mean", 400.0))]
+    assert form_error([part("spectral_line", "line", 20.0, 9)], chosen, share=0.01) == 0.0
+    assert form_error([part("warm_up", "mean", 20.0)], chosen, share=0.01) == pytest.approx(4.0)
+
+
+def test_the_spectrum_of_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
+    driven = replace(claim(part("vibration_noise", "power", 200.0)), driver=("vibration",))
+    steady = claim(part("relative_intensity_noise", "power", 200.0))
+    for chosen, effect, error in (
+        (driven, "logger_filter", 20.0),
+        (driven, "temperature_noise", 2.0),
+        (steady, "logger_filter", 2.0),
+    ):
+        assert form_error([part(effect, "power", 17.0)], [chosen], share=0.01) == pytest.approx(error)
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])
+def test_a_spectrum_is_straightened_by_as_much_as_its_filter_takes(weight: float) -> None:
+    """Weights of 1 - a and a take 4 a (1 - a) of what a mean of two takes; a line stays in, and no slope is left that looks like one."""
+    rng = np.random.default_rng(8)
+    raw = rng.standard_normal(60_001) + 0.15 * np.sin(2.0 * np.pi * 4.0 * np.arange(60_001) / 10.0)
+    record = reduce_log(make_log(((1.0 - weight) * raw[1:] + weight * raw[:-1])[None], rate=10.0, unit="deg/h"))
+    lines = record["line_frequency"].values
+    mean_of_two = {"cutoff": 0.0, "order": 2.0, "length": 0.2, "pick": 0.0, "instrument": 1.0}
+    found, stopped = straightened(record, "x", "logger_filter", mean_of_two, np.ones(lines.size))
+    power = found["line_power"].mean("part").values[0] * 10.0
+    near = np.abs(lines - 4.0) < 0.2
+    kept = ~near & ~stopped
+    slope, level = np.polyfit(lines[kept], power[kept], 1)
+    assert level == pytest.approx(1.0, abs=0.05)
+    assert slope * 5.0 == pytest.approx(0.0, abs=0.13)
+    assert stopped.any() == (weight == 0.5)
+    gains = line_gains(found["line_power"].values[None], found["line_weight"].values)[0, 0]
+    assert lines[gains.argmax()] == pytest.approx(4.0, abs=0.1)
+    assert gains.max() > 20.0
+    assert np.where(near | stopped, -np.inf, gains).max() < 5.0
+    again, _ = straightened(found, "x", "logger_filter", mean_of_two, np.ones(lines.size))
+    xr.testing.assert_identical(again, found)

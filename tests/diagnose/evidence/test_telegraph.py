@@ -1,0 +1,286 @@
+"""A bias that hops between two levels in the block means: what it gains, what else gains nothing, and what a diagnosis makes of it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.signal import lfilter
+
+from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.estimate.telegraph_sizes import level_sizes
+from gyrostab.diagnose.evidence.telegraph import HOPS, level_courses, level_gains
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identifiability import possible
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.identify.switching import followed_first, hops_alone
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part, take_parts
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import Found
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.ingest.make_log import make_log
+from gyrostab.simulate import simulate
+from tests.support.named import nulls
+
+BLOCKS, STEP, WHITE = 100, 20.0, 0.01
+WALKS, FLICKERS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0]), np.array([0.0, 0.05, 0.2])
+
+
+def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
+    """Records (record, block) as reduced data of one axis, and a baseline in which K and B are free."""
+    begin = np.arange(mean.shape[1]) * STEP
+    data = xr.Dataset(
+        {"mean": (("record", "axis", "block"), mean[:, None]), "begin": ("block", begin), "end": ("block", begin + STEP)},
+        {"axis": ["x"]},
+        {"block_s": STEP},
+    )
+    K, B = (one.ravel() for one in np.meshgrid(WALKS, FLICKERS, indexing="ij"))
+    baseline = xr.Dataset(
+        {
+            "known_mean": (("axis", "block"), np.zeros((1, mean.shape[1]))),
+            "mean_variance": (("axis", "block"), np.full((1, mean.shape[1]), WHITE)),
+            **{f"grid_{name}": (("axis", "grid"), one[None]) for name, one in (("K", K), ("B", B), ("prior", 0.0 * K))},
+        },
+        {"axis": ["x"]},
+    )
+    return data, baseline
+
+
+def hops(rng: np.random.Generator, low: float, high: float, blocks: int = BLOCKS) -> np.ndarray:
+    """Share of each block on the upper level; times in seconds."""
+    fine, t, level = np.zeros(blocks * 20), 0.0, int(rng.integers(2))
+    while t < fine.size:
+        stay = rng.exponential((low, high)[level])
+        fine[int(t) : int(t + stay) + 1] = level
+        t, level = t + stay, 1 - level
+    return fine.reshape(blocks, 20).mean(axis=1)
+
+
+def white(rng: np.random.Generator, records: int) -> np.ndarray:
+    return np.sqrt(WHITE) * rng.standard_normal((records, BLOCKS))
+
+
+def test_finds_hops_and_their_numbers() -> None:
+    rng = np.random.default_rng(1)
+    course = np.stack([hops(rng, 120.0, 240.0) for _ in range(20)])
+    gain, found = level_gains(*frame(0.6 * course + white(rng, 20)), axis="x")
+    assert np.median(gain) > 20.0
+    assert (gain > 5.0).mean() >= 0.9
+    assert np.median(found.step) == pytest.approx(0.6, rel=0.05)
+    np.testing.assert_allclose(np.median(found.times, axis=0) * STEP, [120.0, 240.0], rtol=0.3)
+    assert np.sqrt(np.mean((found.share[gain > 5.0] - course[gain > 5.0]) ** 2)) < 0.12
+
+
+def test_finds_hops_beside_a_walk_of_several_steps() -> None:
+    rng = np.random.default_rng(2)
+    walk = np.cumsum(0.07 * rng.standard_normal((20, BLOCKS)), axis=1)
+    course = np.stack([hops(rng, 150.0, 150.0) for _ in range(20)])
+    gain, found = level_gains(*frame(1.5 * course + walk + white(rng, 20)), axis="x")
+    assert np.median(gain) > 10.0
+    assert np.median(found.step[gain > 10.0]) == pytest.approx(1.5, rel=0.1)
+
+
+def test_is_a_lower_bound_of_a_bayes_factor() -> None:
+    """Over records of the noise that the baseline allows, the mean Bayes factor is one."""
+    rng = np.random.default_rng(3)
+    K = rng.choice(WALKS, 300) * np.sqrt(STEP / 3600.0)
+    mean = white(rng, 300) + np.cumsum(K[:, None] * rng.standard_normal((300, BLOCKS)), axis=1)
+    gain, _ = level_gains(*frame(mean), axis="x")
+    assert np.isfinite(gain).mean() > 0.3
+    assert np.exp(gain).mean() < 1.0
+    assert gain.max() < 4.0
+
+
+@pytest.mark.parametrize("size", [0.3, 1.0])
+@pytest.mark.parametrize("time", [20.0, 60.0, 200.0])
+def test_a_bias_on_a_spring_is_no_bias_of_two_levels(time: float, size: float) -> None:
+    rng = np.random.default_rng(4)
+    keep = np.exp(-1.0 / time)
+    fine = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal((30, BLOCKS * 20 + 3000)))[:, -BLOCKS * 20 :]
+    gain, _ = level_gains(*frame(size * fine.reshape(30, BLOCKS, 20).mean(axis=2) + white(rng, 30)), axis="x")
+    assert gain.max() < 3.0
+
+
+def test_one_jump_and_back_are_no_two_levels() -> None:
+    mean = np.zeros((1, BLOCKS)) + np.repeat([0.0, 2.0, 0.0], [30, 40, 30])
+    gain, found = level_gains(*frame(mean + white(np.random.default_rng(5), 1)), axis="x")
+    assert found.hops[0] == pytest.approx(2.0, abs=0.2)
+    assert found.hops[0] < HOPS
+    assert gain[0] == -np.inf
+
+
+def test_what_is_given_is_not_found_again_and_blocks_may_be_missing() -> None:
+    rng = np.random.default_rng(6)
+    course = hops(rng, 150.0, 150.0)
+    ramp = np.linspace(0.0, 20.0, BLOCKS)
+    data, baseline = frame((0.8 * course + ramp)[None] + white(rng, 1))
+    data["mean"][:, :, 20:35] = np.nan
+    with_ramp, found = level_gains(data, baseline, axis="x", given=ramp[:, None])
+    assert with_ramp[0] > 10.0
+    assert found.step[0] == pytest.approx(0.8, abs=0.1)
+    again, _ = level_gains(data, baseline, axis="x", given=np.stack([ramp, course], axis=1))
+    assert again[0] < 1.0
+
+
+def test_the_other_sign_is_the_same_bias() -> None:
+    rng = np.random.default_rng(7)
+    values = (hops(rng, 100.0, 300.0) + white(rng, 1)[0])[:, None]
+    variance, all_there, constant = np.full(BLOCKS, WHITE), np.ones(BLOCKS, bool), np.ones((BLOCKS, 1))
+    one, other = (level_courses(sign * values, variance, all_there, constant) for sign in (1.0, -1.0))
+    np.testing.assert_allclose(one.share, 1.0 - other.share, atol=0.02)
+    np.testing.assert_allclose(one.times, other.times[:, ::-1], rtol=0.02)
+    np.testing.assert_allclose(one.step, other.step, rtol=0.01)
+
+
+def part(state: State, course: np.ndarray, axis: str = "x", gain: float = 50.0) -> Part:
+    variant = Variant({"low": 100.0, "high": 200.0, "hops": 18.0}, ("step",), course[None, None])
+    return Part(Candidate("telegraph", "levels", (), (variant,)), variant, (axis,), gain)
+
+
+def state_of(mean: np.ndarray) -> State:
+    data, baseline = frame(mean[None])
+    return State(data.isel(record=0), baseline, np.ones((1, BLOCKS, 1)), np.zeros((1, BLOCKS), np.bool_))
+
+
+def test_a_bias_of_three_levels_is_not_possible() -> None:
+    rng = np.random.default_rng(8)
+    first, second = hops(rng, 150.0, 150.0), hops(rng, 200.0, 200.0)
+    two = state_of(first + white(rng, 1)[0])
+    assert possible([part(two, first)], two)
+    more = state_of(first + 0.8 * second + white(rng, 1)[0])
+    assert not possible([part(more, first)], more)
+
+
+def test_sizes_are_those_of_the_course() -> None:
+    rng = np.random.default_rng(9)
+    course = hops(rng, 100.0, 200.0)
+    state = state_of(0.5 * course + white(rng, 1)[0])
+    sizes = level_sizes([part(state, course)], ("x",), state)
+    value, error = sizes["step"]
+    assert abs(value - 0.5) < 4.0 * error
+    assert 0.015 < error < 0.06  # twice the noise of a mean over the root of the blocks
+    assert sizes["low"] == (100.0, pytest.approx(100.0 / 3.0))
+    assert sizes["high"] == (200.0, pytest.approx(200.0 / 3.0))
+
+
+def led(course: np.ndarray, gain: float, axis: str = "x") -> Part:
+    """A mean that follows the temperature."""
+    variant = Variant({}, ("sensitivity",), course[None, None])
+    return Part(Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, (axis,), gain)
+
+
+def jump(place: int, gain: float) -> Part:
+    variant = Variant({"at": place * STEP}, ("step",), (np.arange(BLOCKS) >= place).astype(float)[None, None])
+    return Part(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), gain)
+
+
+FOLLOWS, HOPS_FIRST = ["temperature_bias(temperature)"], ["telegraph", "temperature_bias(temperature)"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "gain", "axis", "expected"),
+    [
+        ("the same", 20.0, "x", FOLLOWS),  # a channel that switches, one block early
+        ("another", 20.0, "x", HOPS_FIRST),
+        ("another", 60.0, "x", FOLLOWS),  # what brings more comes first
+        ("the same", 60.0, "y", HOPS_FIRST),
+    ],
+)
+def test_what_follows_a_channel_that_may_hop_comes_first(kind: str, gain: float, axis: str, expected: list[str]) -> None:
+    rng = np.random.default_rng(10)
+    course = hops(rng, 120.0, 180.0)
+    state = state_of(0.6 * course + white(rng, 1)[0])
+    channel = np.roll(course, 1) if kind == "the same" else np.sin(np.arange(BLOCKS) / 9.0)
+    parts = {"telegraph": [part(state, course)], FOLLOWS[0]: [led(channel, gain, axis)], "bias_jump": [jump(50, 20.0)]}
+    assert followed_first(HOPS_FIRST, parts, state) == expected
+    assert followed_first(["telegraph", "bias_jump"], parts, state) == ["telegraph", "bias_jump"]
+
+
+REAL, HOP = 41, -1  # blocks: a jump of another size than the hops; and the last hop
+
+
+@pytest.mark.parametrize(
+    ("size", "places", "kept"),
+    [(0.0, (0, HOP), ()), (3.0, (REAL,), (REAL,)), (3.0, (REAL, HOP), (REAL,))],
+    ids=["none", "one", "one of two"],
+)
+def test_jumps_that_are_hops_themselves_are_none(size: float, places: tuple[int, ...], kept: tuple[int, ...]) -> None:
+    """The first hop and the last one were taken for jumps before the hops were named; a jump that is four times as large is one."""
+    rng = np.random.default_rng(12)
+    course = hops(rng, 150.0, 200.0)
+    moves = np.flatnonzero(np.abs(np.diff(course)) > 0.5) + 1
+    start = state_of(0.7 * course + size * (np.arange(BLOCKS) >= REAL) + white(rng, 1)[0])
+    candidate = part(start, course).candidate
+
+    def gains(_: object, state: State) -> list[Found]:
+        columns = state.given.get(("mean", "x"), [])
+        gain, found = level_gains(state.reduced, state.baseline, axis="x", given=np.stack(columns, axis=-1) if columns else None)
+        return [Found(candidate, [("x",)], gain[:, None], (Variant({}, ("step",), found.share[0][None, None]),))]
+
+    def state_with(some: Sequence[Claim]) -> State:
+        return take_parts(start, [one for claim in some for one in claim.parts])
+
+    jumps = [jump(place if place == REAL else int(moves[place]), 20.0) for place in places]
+    first = Claim("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
+    (beside,) = gains((), state_with([first]))
+    gain = float(beside.gain[0, 0])
+    hopping = Claim("telegraph", (), ("x",), (Part(candidate, beside.best[0], ("x",), gain),), gain, 8.0)
+    left = hops_alone([first, hopping], state_with, gains, 8.0)
+    assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
+    assert [one.variant.values["at"] for one in left[0].parts if one.candidate.effect == "bias_jump"] == [place * STEP for place in kept]
+    assert np.abs(np.corrcoef(left[-1].parts[0].variant.design[0, 0], course)[0, 1]) > 0.98
+
+
+def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Naming:
+    """What a bias that switches between two levels, for so many blocks each, is named, beside a supply that does so with a scatter [V]."""
+    course = np.repeat(np.arange(len(stays)) % 2, stays).astype(float)
+    rng = np.random.default_rng(seed)
+    supply, noise = 24.0 + course + scatter * rng.standard_normal(course.size), rng.standard_normal(200 * course.size)
+    log = make_log(
+        np.repeat(step * course, 200) + noise, rate=10.0, unit="deg/h", channels={"supply_voltage": (np.repeat(supply, 200), "V")}
+    )
+    reduced = reduce_log(log, block="20s")
+    return name_effects(reduced, *nulls(reduced, 40))
+
+
+def test_the_search_asks_hops_whether_jumps_named_before_are_theirs(one_thread) -> None:
+    """The supply that scatters holds the hops back; so the last of them is a jump first, and the search ends without it."""
+    naming = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
+    assert [claim.effect for claim in naming.claims] == ["telegraph"]
+    assert naming.verdict == "explained"
+
+
+def test_the_search_names_the_channel_that_switches_before_the_hops(one_thread) -> None:
+    """Two levels bring more than a supply that is known with a scatter, and still it is the cause."""
+    naming = switched([45, 14, 3, 12, 3, 10, 3, 5], 1, step=0.6, scatter=0.3)
+    assert [claim.effect for claim in naming.claims] == ["supply_bias"]
+
+
+@pytest.fixture(scope="module")
+def found():
+    model = {
+        "log": {"axes": ["x", "y"]},
+        "noise": {"N": 0.003, "B": 0.002, "K": 0.01},
+        "effect": [{"name": "telegraph", "axes": ["y"], "step": 0.4, "low": 120.0, "high": 90.0}],
+    }
+    return diagnose(simulate(model, duration="30min", rate=5.0, seed=11), nulls=100, seed=1)
+
+
+def test_a_diagnosis_names_it_with_its_numbers(found) -> None:
+    assert [(one["name"], one["axes"]) for one in found.effects] == [("telegraph", ["y"])]
+    numbers = found.effects[0]["parameters"]
+    assert abs(numbers["step"]["value"] - 0.4) < 3.0 * numbers["step"]["stderr"]
+    for name, true in (("low", 120.0), ("high", 90.0)):
+        assert abs(numbers[name]["value"] - true) < 3.0 * numbers[name]["stderr"]
+    assert found.effects[0]["alternatives"] == []
+    assert found.content["held_out"]["log_likelihood_gain"] > 10.0
+
+
+def test_the_model_hops_and_its_noise_does_not(found) -> None:
+    effect = next(one for one in found.model["effect"] if one["name"] == "telegraph")
+    assert float(np.atleast_1d(effect["step"])[0]) == pytest.approx(0.4, rel=0.15)
+    assert found.model["noise"]["y"]["K"] < 0.3  # with the hops for noise it is above 1
+    again = simulate(found.model, duration="30min", rate=5.0, seed=12)["rate"].coarsen(time=100).mean().std("time")
+    assert 0.1 < float(again.sel(axis="y")) < 0.3
+    assert float(again.sel(axis="x")) < 0.08

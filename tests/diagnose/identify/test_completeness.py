@@ -1,0 +1,113 @@
+"""What names leave in the powers: nothing where they are right, a structure in time where they are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.completeness import unrest
+from gyrostab.diagnose.identify.forward_search import _Search, name_effects
+from gyrostab.diagnose.predict.condition import reweighted
+from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.nuisance import generic_candidates
+from gyrostab.diagnose.predict.search import Found, Tallies, gains
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.ingest.make_log import make_log
+from tests.support.named import nulls
+
+BLOCKS, LENGTH = 120, 200
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Dataset:
+    """White noise at 10 Hz on one axis, its standard deviation times a factor for each block of 20 s."""
+    rng = np.random.default_rng(seed)
+    rates = rng.standard_normal((1, BLOCKS * LENGTH)) * np.repeat(factor, LENGTH)
+    if gaps:
+        rates[:, np.repeat(rng.random(BLOCKS * 20) < 0.3, LENGTH // 20)] = np.nan
+    return reduce_log(make_log(rates, rate=10.0, unit="deg/h"), block="20s")
+
+
+def left(reduced: xr.Dataset, *columns: np.ndarray) -> float:
+    """Unrest beside columns (block,) of added white power."""
+    state: State = begin_state(reduced, calibrate(reduced))
+    spread = [np.broadcast_to(one[:, None], state.weight.shape[1:]).astype(float) for one in columns]
+    return unrest(reweighted(state.with_columns("power", "x", spread)) if columns else state, "x")
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_noise_that_stands_still_is_at_rest(gaps: bool) -> None:
+    found = [left(record(np.ones(BLOCKS), seed=seed, gaps=gaps)) for seed in range(12)]
+    assert max(found) < 2.0
+    assert np.median(found) < 0.0
+
+
+def test_bursts_are_unrest_and_none_once_they_are_known() -> None:
+    burst = np.zeros(BLOCKS)
+    burst[[10, 11, 12, 30, 31, 52, 53, 54, 55, 90, 91, 92]] = 0.6
+    reduced = record(np.sqrt(1.0 + burst))
+    assert left(reduced) > 8.0
+    assert left(reduced, burst) < 2.0
+    assert left(reduced, np.linspace(0.0, 1.0, BLOCKS)) > 8.0
+
+
+def test_a_single_loud_block_is_no_course_of_time() -> None:
+    one = np.ones(BLOCKS)
+    one[40] = 30.0
+    assert left(record(one)) < 8.0
+
+
+def test_blocks_that_are_masked_do_not_count() -> None:
+    burst = np.ones(BLOCKS)
+    burst[20:40] = 1.5
+    reduced = record(burst)
+    state = begin_state(reduced, calibrate(reduced))
+    assert unrest(state, "x") > 8.0
+    assert unrest(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
+
+
+def test_a_smooth_name_for_bursts_is_taken_back() -> None:
+    level = np.ones(BLOCKS)
+    rng = np.random.default_rng(4)
+    level[60:] = np.where(rng.random(60) < 0.4, 1.35, 1.0)  # later is louder on average, and not at all steadily
+    reduced = record(level)
+    baseline, records = nulls(reduced, 40)
+    found = name_effects(reduced, baseline, records)
+    assert not [claim for claim in found.claims if claim.effect == "ageing_noise"]
+    assert found.verdict == "unknown"
+    steady = record(np.linspace(0.9, 1.15, BLOCKS))
+    baseline, records = nulls(steady, 40)
+    assert [claim.effect for claim in name_effects(steady, baseline, records).claims] == ["ageing_noise"]
+
+
+def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
+    rng = np.random.default_rng(6)
+    loud = np.ones(BLOCKS)
+    loud[40:60] = 20.0
+    reduced = reduce_log(make_log(rng.standard_normal((2, BLOCKS * LENGTH)) * np.repeat(loud, LENGTH), rate=10.0, unit="deg/h"))
+    state = begin_state(reduced, calibrate(reduced))
+    search = _Search(generic_candidates(reduced), fold_blocks(reduced), Tallies({}), 7.0)
+
+    def common(found: list[Found]) -> float:
+        return max(float(one.gain.max()) for one in found if one.candidate.effect == "~cov")
+
+    assert common(gains(search.candidates, reduced, state, search.folds)) > 100.0
+    assert common(search._ranked(state, set())) < 3.0
+
+
+def test_no_jump_and_no_ageing_is_named_beside_a_drift_of_no_name_that_brings_more():
+    noise = 0.5 * np.random.default_rng(1).standard_normal((2, 9000))[1:]
+    seconds = np.arange(9000) / 10.0
+    turned = [0, 300, 900, 500, 1200, 800, 1100, 950, 1190, 700, 1000, 400, 0]  # deg/h, with no channel to tell of it
+    noise += np.interp(seconds, np.linspace(0.0, 640.0, 13), turned)
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
+    found = name_effects(reduced, *nulls(reduced, 40))
+    assert not found.claims
+    assert {one.generic for one in found.unknown} == {"~bias(t)"}
+    assert {one.axes for one in found.unknown} == {("y",)}

@@ -1,0 +1,217 @@
+"""Names for simulated effects, and none for noise."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
+from gyrostab.diagnose.evidence.sample_counts import count_gains, expected_counts
+from gyrostab.diagnose.evidence.spectral_lines import line_gains
+from gyrostab.diagnose.identify.forward_search import Claim, name_effects, tail_level
+from gyrostab.diagnose.identify.identifiability import possible
+from gyrostab.diagnose.identify.surrogates import beats_slides
+from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.search import together
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.errors import OptionError
+from gyrostab.ingest.make_log import make_log
+from tests.support.named import WORLD, nulls, record
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def named(effects, *, environment=WORLD["usual"], seed=1, drop=(), count=40):
+    reduced = record(effects, environment=environment, seed=seed, drop=drop)
+    baseline, records = nulls(reduced, count)
+    return name_effects(reduced, baseline, records)
+
+
+VIBRATION = [{"name": "vibration_noise", "white": 6e-4, "axes": ["x"]}]
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    return named(VIBRATION)
+
+
+def test_noise_gets_no_name():
+    found = named([], seed=2)
+    assert found.verdict == "no mismatch"
+    assert found.claims == found.unknown == ()
+    assert 3.0 < found.threshold < 15.0
+    assert found.null_best.size == 40
+
+
+def test_vibration_noise_is_named_on_its_axis(shaken):
+    (claim,) = shaken.claims
+    assert claim.effect == "vibration_noise"
+    assert claim.axes == ("x",)
+    assert claim.driver == ("vibration",)
+    assert claim.gain > claim.threshold >= shaken.threshold
+    assert claim.surrogate_p <= 0.01
+    assert "temperature_noise" not in claim.alternatives
+    assert shaken.verdict == "explained"
+
+
+def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
+    """A part of negative size on an axis without the effect is dropped, not the effect with it."""
+    state, (claim,) = shaken.state, shaken.claims
+    (part,) = (one for one in claim.parts if one.candidate.view == "power")
+    elsewhere = [replace(part, row=(axis,)) for axis in "yz"]
+    sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
+    monkeypatch.setattr(sys.modules["gyrostab.diagnose.predict.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
+    assert possible([part, *elsewhere], state) == [part, elsewhere[1]]
+
+
+def test_sizes_beyond_what_the_registry_allows_are_impossible(shaken):
+    """A bias of 15 deg/h for each of some 40 degC is that of a broken instrument, or no effect of temperature."""
+    bias = next(one for one in shaken.candidates if one.effect == "temperature_bias" and one.view == "mean")
+    variant = next(one for one in bias.variants if one.columns == ("sensitivity",))
+    part = Part(bias, variant, ("y",), 50.0)
+    for size, answer in ((5.0, [part]), (15.0, [])):
+        state = shaken.state
+        mean = state.reduced["mean"] + size * xr.DataArray(variant.design[0, 0], dims="block").where(state.reduced["axis"] == "y", 0.0)
+        assert possible([part], replace(state, reduced=state.reduced.assign(mean=mean))) == answer
+
+
+@pytest.mark.parametrize(
+    ("table", "environment", "others"),
+    [
+        ({"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}, "usual", {"g_sensitivity"}),
+        ({"name": "shupe", "sensitivity": 0.4, "axes": ["x"]}, "usual", {"temperature_bias", "thermal_hysteresis", "warm_up"}),
+        ({"name": "shared_source", "N": [0.0012, 0.0012, -0.0012], "axes": ["x", "y", "z"]}, "usual", set()),
+        ({"name": "spikes", "per_hour": 100.0, "kind": "outlier", "size": 30.0, "axes": ["z"]}, "usual", set()),
+    ],
+    ids=lambda value: value["name"] if isinstance(value, dict) else None,
+)
+def test_single_effects_are_named(table, environment, others):
+    found = named([table], environment=WORLD[environment])
+    assert [claim.effect for claim in found.claims] == [table["name"]]
+    (claim,) = found.claims
+    assert claim.axes == tuple(table["axes"])
+    assert set(claim.alternatives) <= others
+
+
+def test_without_its_channel_an_effect_is_not_named():
+    found = named(VIBRATION, drop=("vibration",))
+    assert not found.claims
+    assert found.verdict == "unknown"
+    assert {one.generic for one in found.unknown} <= {"~N(t)", "~S(f)", "~burst"}
+    assert all(one.axes == ("x",) for one in found.unknown)
+
+
+def test_two_effects_are_both_named():
+    found = named([*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}])
+    assert {(claim.effect, claim.axes) for claim in found.claims} == {("vibration_noise", ("x",)), ("vibration_rectification", ("y",))}
+
+
+def test_slid_channels_do_worse(shaken):
+    (claim,) = shaken.claims
+    start = replace(shaken.state, given={})
+    beats, p_value = beats_slides(claim.parts, start, shaken.folds)
+    assert beats
+    assert p_value <= 0.01
+    elsewhere = [replace(part, row=("z",)) for part in claim.parts]
+    assert not beats_slides(elsewhere, start, shaken.folds)[0]
+
+
+def test_what_is_named_is_taken_out_of_the_rest(shaken):
+    (claim,) = shaken.claims
+    loud = shaken.state.weight[0] / shaken.state.baseline["spectrum"].values[0]
+    vibration = shaken.state.reduced["channel_vibration"].values
+    assert loud[vibration > 4].mean() > 1.2
+    assert loud[vibration < 1].mean() == pytest.approx(1.0, abs=0.05)
+    again = explain_away(shaken.state, list(claim.parts))
+    np.testing.assert_allclose(again.weight, shaken.state.weight, rtol=1e-3)
+
+
+def test_too_few_null_records_are_refused():
+    reduced = record([])
+    baseline, records = nulls(reduced, 20)
+    with pytest.raises(OptionError, match="20 null records are too few"):
+        name_effects(reduced, baseline, records)
+
+
+def test_claims_are_plain(shaken):
+    assert all(isinstance(claim, Claim) for claim in shaken.claims)
+
+
+# ---------------------------------------------------------------------------------------------------------------- parts
+
+
+def test_other_axes_must_pay_for_themselves():
+    assert together(np.array([10.0, 1.0, -5.0])) == 10.0
+    assert together(np.array([10.0, 10.0, 10.0])) == 27.0
+    assert together(np.array([-2.0, -1.0])) == -1.0
+
+
+def test_level_of_an_exponential_tail():
+    sample = np.random.default_rng(2).exponential(size=50_000)
+    for level in (0.1, 0.01, 0.001):
+        assert tail_level(sample, level) == pytest.approx(-np.log(level), rel=0.05)
+
+
+def subsets(blocks: int) -> np.ndarray:
+    return fold_subsets(fold_blocks(record([]).isel(block=slice(0, blocks))))
+
+
+def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
+    rng = np.random.default_rng(4)
+    usual = rng.poisson(0.05, (500, 2, 120))
+    mean, spread = expected_counts(usual)
+    np.testing.assert_allclose(mean.mean(axis=1), 0.05, rtol=0.1)
+    np.testing.assert_allclose(spread, 1.0, atol=0.2)
+    null = count_gains(usual, mean, spread, subsets(120))
+    raised = count_gains(rng.poisson(0.3, (50, 2, 120)), mean, spread, subsets(120))
+    assert np.quantile(null, 0.99) < 3.0
+    assert raised.min() > 5.0
+
+
+def test_blocks_that_are_lost_are_expected_to_count_nothing():
+    """Half of the blocks are lost: in the others as many as usual are no more than usual, and three times as many are."""
+    rng = np.random.default_rng(5)
+    there = np.arange(120) < 60
+    usual = rng.poisson(1.0 * there, (400, 1, 120))
+    mean, spread = expected_counts(usual)
+    np.testing.assert_allclose([mean[0, there].mean(), mean[0, ~there].mean()], [1.0, 0.0], atol=0.02)
+    assert (mean > 0.0).all()
+    few = count_gains(rng.poisson(0.5 * there, (50, 1, 120)), mean, spread, subsets(120))
+    many = count_gains(rng.poisson(3.0 * there, (50, 1, 120)), mean, spread, subsets(120))
+    assert few.max() < 3.0
+    assert many.min() > 40.0
+
+
+def test_every_line_of_a_comb_is_named():
+    """More lines than other effects are looked for."""
+    quiet = reduce_log(make_log(np.random.default_rng(3).standard_normal((2, 24_000)), rate=10.0, unit="deg/h"))
+    comb = np.arange(5, quiet.sizes["line"], 7)
+    loud = np.ones(quiet.sizes["line"])
+    loud[comb] = 4.0
+    shape = xr.DataArray(np.stack([loud, np.ones_like(loud)]), dims=("axis", "line"))
+    reduced = quiet.assign(line_power=(quiet["line_power"] * shape).transpose(*quiet["line_power"].dims))
+    baseline, chance = nulls(quiet, 40)
+    found = name_effects(reduced, baseline, chance)
+    assert {(claim.effect, claim.axes) for claim in found.claims} == {("spectral_line", ("x",))}
+    assert sorted(part.place for claim in found.claims for part in claim.parts) == comb.tolist()
+    assert comb.size == 14
+
+
+def test_a_line_stands_out_at_its_place_only():
+    rng = np.random.default_rng(5)
+    weight = np.full((1, 8), 22.0)
+    power = rng.gamma(22.0, 1 / 22.0, (40, 1, 8, 500))
+    null = line_gains(power, weight).max(axis=-1)
+    power[:, :, :, 123] *= 2.0
+    found = line_gains(power, weight)
+    assert np.quantile(null, 0.95) < 4.0
+    assert (found.argmax(axis=-1) == 123).all()
+    assert found.max(axis=-1).min() > 10.0
+
+
+def test_folds_of_all_lengths_are_used():
+    assert len(subsets(120)) == 1 + 3 * FOLDS

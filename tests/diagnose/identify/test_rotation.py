@@ -1,0 +1,63 @@
+"""Errors of the scale factor and a turning that an axis really sees: the share of the turning tells them apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import by_key
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identifiability import plainer_effect, possible
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.simulate import simulate
+from tests.support.named import nulls
+
+_TURNS = [[0, 0.0], [300, 0.0], [310, 108.0], [600, 108.0], [610, 40.0], [800, 40.0], [810, 0.0], [1000, 0.0], [1010, 90.0], [1200, 90.0]]
+
+
+def _reduced(share: float) -> xr.Dataset:
+    """Statistics of a log of which axis z sees a share of the turning."""
+    effect = {"name": "real_motion", "spin": share, "sway": 0.0, "axes": ["z"]}
+    model = {
+        "log": {"axes": ["x", "z"]},
+        "noise": {"N": 0.003},
+        "effect": [effect],
+        "environment": [{"profile": "rotation", "points": _TURNS}],
+    }
+    return reduce_log(simulate(model, duration="20min", rate=10.0, seed=3).compute())
+
+
+def _parts(reduced: xr.Dataset):
+    baseline = calibrate(reduced)
+    known = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect in ("scale_factor", "real_motion")]
+    state = begin_state(reduced, baseline)
+    parts = by_key(gains([one for one in known if one.view == "mean"], reduced, state, fold_blocks(reduced)))
+    return {several[0].candidate.effect: several for several in parts.values()}, state
+
+
+@pytest.mark.parametrize(("share", "plainer", "allowed"), [(3e-6, "scale_factor", False), (1e-3, "scale_factor", True), (0.5, None, True)])
+def test_the_share_of_the_turning_tells_what_it_is(share, plainer, allowed):
+    parts, state = _parts(_reduced(share))
+    motion, error = parts["real_motion"], parts["scale_factor"]
+    assert motion[0].row == ("z",)
+    assert motion[0].gain > 30.0
+    assert plainer_effect(motion, state) == plainer
+    assert bool(possible(motion, state)) is allowed
+    assert plainer_effect(error, state) is None
+
+
+def test_a_few_millionths_of_the_turning_are_an_error_of_the_scale_factor():
+    reduced = _reduced(1e-6)
+    baseline, records = nulls(reduced, 40)
+    found = name_effects(reduced, baseline, records)
+    (claim,) = found.claims
+    assert claim.effect == "scale_factor"
+    assert claim.axes == ("z",)
+    assert "real_motion" not in claim.alternatives
+    assert np.isfinite(claim.gain)

@@ -1,0 +1,275 @@
+"""Boxes around what differs: where, how far, how sure; and none where nothing does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.nulls.scores import null_scores
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.errors import OptionError
+from gyrostab.ingest.make_log import make_log
+from tests.support.reduced_records import BLOCK_S, RATE, baseline, chunks, records, smallest_p
+
+SIGMA = 1.8  # of a sample [deg/h]: 0.003 deg/sqrt(h) at 100 Hz
+SIZE = 360_000
+
+
+@pytest.fixture(scope="module")
+def base() -> xr.Dataset:
+    return baseline()
+
+
+@pytest.fixture(scope="module")
+def null(base):
+    return null_scores(base, chunks(base, 200, np.random.default_rng(21)))
+
+
+def _overlap(found, begin, end):
+    shared = min(float(found["end"]), end) - max(float(found["begin"]), begin)
+    return max(shared, 0.0) / (max(float(found["end"]), end) - min(float(found["begin"]), begin))
+
+
+def test_false_alarms_come_as_often_as_asked(base, null):
+    """Over all views, by other records than those that set the limits."""
+    p = np.concatenate([smallest_p(chunk, base, null) for chunk in chunks(base, 300, np.random.default_rng(22))])
+    for level in (0.02, 0.1):
+        low, high = stats.binom.ppf([0.001, 0.999], 300, level)
+        slack = 1.0 + 2.0 / np.sqrt(200 * level)  # what 200 null records leave open
+        assert low / slack <= (p < level).sum() <= high * slack, level
+    alarms = [locate(records(base, 1, np.random.default_rng(seed)).isel(record=0), base, null).sizes["mismatch"] for seed in range(15)]
+    assert sum(alarms) <= 2
+
+
+def test_a_level_decides_what_is_told(base, null):
+    found = records(base, 1, np.random.default_rng(40)).isel(record=0)
+    found["power"][0, 75:90] *= 1.06
+    p = float(smallest_p(found, base, null))
+    assert 1e-6 < p < 0.2
+    assert locate(found, base, null, level=1.5 * p).sizes["mismatch"] >= 1
+    assert locate(found, base, null, level=0.7 * p).sizes["mismatch"] == 0
+    for level in (0.0, 0.7, -1.0):
+        with pytest.raises(OptionError, match="false alarms"):
+            locate(found, base, null, level=level)
+
+
+def test_too_few_null_records_are_refused(base):
+    with pytest.raises(OptionError, match="25 null records are too few"):
+        null_scores(base, chunks(base, 25, np.random.default_rng(1)))
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3])
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_a_burst_of_noise_has_its_box(share, missing):
+    base = baseline(missing=missing)
+    null = null_scores(base, chunks(base, 75, np.random.default_rng(23), missing=missing))
+    overlaps = []
+    for seed in range(9):
+        found = records(base, 1, np.random.default_rng(seed), missing=missing).isel(record=0)
+        found["power"][1, 75:90] *= 1.0 + share**2
+        boxes = locate(found, base, null)
+        boxes = boxes.sel(mismatch=(boxes["view"] == "davar") & (boxes["axes"] == "y"))
+        overlaps.append(_overlap(boxes.isel(mismatch=0), 1500.0, 1800.0) if boxes.sizes["mismatch"] else 0.0)
+        if share == 0.5:
+            assert boxes.sizes["mismatch"] == 1
+            assert float(boxes["ratio"][0]) == pytest.approx(1.25, abs=0.08)
+            assert float(boxes["tau_min_s"][0]) == 1.0 / RATE
+            assert float(boxes["p_value"][0]) < 1e-4
+            assert int(boxes["sign"][0]) == 1
+    assert np.median(overlaps) >= 0.7
+
+
+def test_a_step_of_the_mean_has_its_box(base, null):
+    overlaps = []
+    for seed in range(9):
+        found = records(base, 1, np.random.default_rng(seed)).isel(record=0)
+        found["mean"][0, 30:45] += 0.1
+        found["mean"][0, 120:140] -= 0.1
+        boxes = locate(found, base, null)
+        boxes = boxes.sel(mismatch=boxes["view"] == "mean")
+        assert boxes.sizes["mismatch"] == 2
+        assert set(boxes["axes"].values) == {"x"}
+        for box, begin, end in ((boxes["sign"] > 0, 600.0, 900.0), (boxes["sign"] < 0, 2400.0, 2800.0)):
+            one = boxes.sel(mismatch=box).isel(mismatch=0)
+            overlaps.append(_overlap(one, begin, end))
+            assert abs(float(one["estimate"])) == pytest.approx(0.1, abs=0.045)
+    assert np.median(overlaps) >= 0.7
+
+
+def test_a_band_has_its_averaging_times(base, null):
+    """Noise between 3 and 12 Hz alone is a box around tau = 0.37 / f and no broader than that."""
+    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    inside = (found["frequency"].values > 3.0) & (found["frequency"].values < 12.0)
+    found["power"][0, 60:120] *= 1.0 + 3.0 * xr.DataArray(inside.astype(float), dims="band")
+    box = locate(found, base, null).isel(mismatch=0)
+    assert str(box["view"].values) == "davar"
+    assert float(box["tau_min_s"]) in (0.02, 0.04)
+    assert float(box["tau_min_s"]) < 0.37 / 7.0 < float(box["tau_max_s"])
+    assert float(box["tau_max_s"]) <= 0.32
+    assert _overlap(box, 1200.0, 2400.0) > 0.95
+
+
+def test_less_noise_than_simulated_has_its_sign(base, null):
+    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    found["power"] *= 0.9
+    boxes = locate(found, base, null)
+    assert boxes.sizes["mismatch"] == 1  # of all axes together
+    assert sorted(str(boxes["axes"].values[0]).split()) == ["x", "y", "z"]
+    assert (float(boxes["begin"][0]), float(boxes["end"][0])) == (0.0, 3600.0)
+    assert int(boxes["sign"][0]) == -1
+    assert float(boxes["ratio"][0]) == pytest.approx(0.9, abs=0.02)
+
+
+def test_two_bursts_are_two_boxes(base, null):
+    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    found["power"][0, 30:45] *= 1.3
+    found["power"][0, 100:115] *= 1.3
+    boxes = locate(found, base, null)
+    begins = sorted(boxes["begin"].values)
+    assert boxes.sizes["mismatch"] == 2
+    assert begins[0] == pytest.approx(600.0, abs=2 * BLOCK_S)
+    assert begins[1] == pytest.approx(2000.0, abs=2 * BLOCK_S)
+
+
+def test_a_mean_that_wanders_is_one_mismatch(base, null):
+    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    found["mean"][1] += 0.5 * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
+    boxes = locate(found, base, null)
+    boxes = boxes.sel(mismatch=boxes["view"] == "mean")
+    assert boxes["sign"].values.tolist() == [0]
+    assert float(boxes["end"][0] - boxes["begin"][0]) > 3000.0
+    assert abs(float(boxes["estimate"][0])) == pytest.approx(0.4, abs=0.15)
+
+
+def test_pieces_become_one_box_and_strangers_do_not():
+    box = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 100.0, "tau_min_s": 0.01, "tau_max_s": 0.1}
+    box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
+    near, far = box | {"begin": 120.0, "end": 160.0, "z": 6.0}, box | {"begin": 400.0, "end": 460.0, "z": 6.0}
+    assert [(one["begin"], one["end"]) for one in merged([far, near, box])] == [(0.0, 160.0), (400.0, 460.0)]
+    assert len(merged([box, box | {"sign": -1}])) == 2
+    assert len(merged([box, box | {"tau_min_s": 1.0, "tau_max_s": 2.0}])) == 2
+    line = box | {"view": "spectrum", "what": "line", "frequency": 13.35, "tau_min_s": 0.028, "tau_max_s": 0.028}
+    assert len(merged([line, line | {"frequency": 13.45, "begin": 100.0, "end": 200.0}])) == 1
+    assert len(merged([line, line | {"frequency": 14.35}])) == 2
+
+
+# -- the whole way from samples ------------------------------------------------------------------------------------------------
+
+
+def _log(seed, effect, missing=0.0):
+    rng = np.random.default_rng(seed)
+    rate = SIGMA * rng.standard_normal((3, SIZE))
+    effect(rate, np.arange(SIZE) / RATE, rng)
+    if missing:
+        rate[:, rng.random(SIZE) < missing] = np.nan
+    return reduce_log(make_log(rate, rate=RATE, unit="deg/h"))
+
+
+def _nothing(rate, t, rng):
+    pass
+
+
+def _baseline_of(reduced):
+    level = SIGMA**2 / RATE
+    axes = reduced.sizes["axis"]
+    return xr.Dataset(
+        {
+            "spectrum": (("axis", "block", "band"), np.full(reduced["power"].shape, level)),
+            "known_mean": (("axis", "block"), np.zeros(reduced["mean"].shape)),
+            "mean_variance": (("axis", "block"), SIGMA**2 / reduced["samples"].values),
+            "coefficient": (("axis", "term"), np.tile([0.0, 0.003, 0.0, 0.0, 0.0], (axes, 1))),
+        },
+        coords={"axis": reduced["axis"], "term": list("QNBKR"), "frequency": reduced["frequency"]},
+    )
+
+
+def _nulls(reduced, base, count, rng):
+    """Null records on the bands of a real reduction."""
+    shape, weight = reduced["shape"].values, reduced["line_weight"].values[..., None]
+    lines = (25, *reduced["line_power"].shape)
+    drop = ["mean", "power", "cross", "line_power", "kurtosis", "outliers", "repeats", "extremes", "zeros"]
+    for _ in range(count // 25):
+        made = reduced.drop_vars(drop)
+        power = base["spectrum"].values * rng.gamma(np.broadcast_to(shape, (25, *shape.shape))) / shape
+        squared = rng.beta(1.0, np.maximum(shape[0] - 1.0, 1e-9), (25, *shape.shape))
+        across = np.sqrt(power * np.roll(power, -1, axis=1) * squared) * np.exp(2j * np.pi * rng.random(power.shape))
+        made["power"] = (("record", "axis", "block", "band"), power)
+        made["cross"] = (("record", "pair", "block", "band"), across[:, [0, 2, 1]])  # x y, z x, y z: the order of the pairs but for a sign
+        made["line_power"] = (("record", "axis", "part", "line"), base["spectrum"].values[0, 0, 0] * rng.gamma(weight, size=lines) / weight)
+        plane = (25, *reduced["mean"].shape)
+        made["mean"] = (("record", "axis", "block"), rng.normal(size=plane) * np.sqrt(base["mean_variance"].values))
+        made["kurtosis"] = (("record", "axis", "block"), rng.normal(size=plane) * np.sqrt(24.0 / 2000.0))
+        for name in ("outliers", "repeats", "zeros"):
+            made[name] = (("record", "axis", "block"), np.zeros(plane))
+        two = rng.integers(0, plane[-1], (2, *plane[:2], 1))
+        made["extremes"] = (("record", "axis", "block"), (two == np.arange(plane[-1])).sum(axis=0))
+        yield made
+
+
+@pytest.fixture(scope="module")
+def raw():
+    reduced = _log(1, _nothing)
+    base = _baseline_of(reduced)
+    return base, null_scores(base, _nulls(reduced, base, 100, np.random.default_rng(24))), reduced
+
+
+def _vibration(rate, t, rng):
+    on = (t >= 1500.0) & (t < 1800.0)
+    rate[0, on] += 0.4 * SIGMA * rng.standard_normal(on.sum())
+
+
+def _line(rate, t, rng):
+    rate[2] += 0.15 * np.sin(2.0 * np.pi * 13.37 * t + 1.0)
+
+
+def _shared(rate, t, rng):
+    rate += 0.12 * SIGMA * np.array([1.0, 0.8, -1.1])[:, None] * rng.standard_normal(t.size)
+
+
+def _spikes(rate, t, rng):
+    at = np.linspace(180_000, 269_000, 12).astype(int)
+    rate[0, at] += rng.choice([-1.0, 1.0], 12) * 15.0 * SIGMA
+
+
+@pytest.mark.parametrize(
+    ("effect", "view", "axes", "begin", "end"),
+    [
+        (_vibration, "davar", {"x"}, 1500.0, 1800.0),
+        (_line, "spectrum", {"z"}, 0.0, 3600.0),
+        (_shared, "cross_axis", {"x", "y", "z"}, 0.0, 3600.0),
+        (_spikes, "distribution", {"x"}, 1800.0, 2700.0),
+    ],
+)
+def test_effects_in_samples_are_found_where_they_are(raw, effect, view, axes, begin, end):
+    base, null, _ = raw
+    boxes = locate(_log(2, effect), base, null)
+    boxes = boxes.sel(mismatch=boxes["view"] == view)
+    assert boxes.sizes["mismatch"] >= 1
+    first = boxes.isel(mismatch=0)
+    assert set(str(first["axes"].values).split()) == axes
+    assert _overlap(first, begin, end) >= 0.7
+    if effect is _line:
+        assert float(first["frequency"]) == pytest.approx(13.37, abs=0.06)
+        assert float(first["estimate"]) == pytest.approx(0.15, rel=0.15)
+    if effect is _spikes:
+        assert str(first["what"].values) == "outliers"
+
+
+def test_samples_without_an_effect_have_no_box(raw):
+    base, null, reduced = raw
+    assert locate(reduced, base, null).sizes["mismatch"] == 0
+
+
+def test_the_table_says_what_the_contract_needs(raw):
+    base, null, _ = raw
+    boxes = locate(_log(2, _vibration), base, null)
+    assert boxes["mismatch"].values[0] == 1
+    assert np.all(np.diff(boxes["p_value"].values) >= 0)
+    start = boxes["start_time"].values[0] - np.datetime64(0, "ns")
+    assert start / np.timedelta64(1, "s") == pytest.approx(float(boxes["begin"][0]))
+    assert {"view", "axes", "tau_min_s", "tau_max_s", "ratio", "p_value", "sign", "end_time"} <= set(boxes.variables)
+    assert boxes.attrs["null_records"] == 100

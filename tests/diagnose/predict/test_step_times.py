@@ -1,0 +1,79 @@
+"""Jumps of the bias are looked for at all times, and first of all where power came back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.step_times import tried_instants
+from gyrostab.physics.prediction import Windows
+from tests.support.named import COEFFICIENT, record
+
+_BACK = 1913.0  # s, between two values of the thinned grid
+
+
+@pytest.fixture(scope="module")
+def restarted():
+    """An hour whose power was lost for 7 s."""
+    reduced = record([]).drop_vars([name for name in ("restart_begin", "restart_end") if name in record([])])
+    return reduced.assign(restart_begin=("restart", [_BACK - 7.0]), restart_end=("restart", [_BACK]))
+
+
+def _jumps(reduced):
+    return next(one for one in effect_candidates(reduced, COEFFICIENT)[0] if one.effect == "bias_jump" and one.view == "mean")
+
+
+def test_a_restart_weighs_as_much_as_all_other_times(restarted):
+    variants = _jumps(restarted).variants
+    weight = np.array([one.weight for one in variants])
+    known = np.array([one.values["at"] == _BACK for one in variants])
+    assert known.sum() == 1
+    assert weight[known].sum() == pytest.approx(weight[~known].sum())
+    assert weight[~known].sum() == pytest.approx((~known).sum())
+
+
+def test_each_time_weighs_as_much_as_the_time_that_it_stands_for():
+    variants = sorted(_jumps(record([])).variants, key=lambda one: one.values["at"])
+    at, weight = (np.array(several) for several in zip(*((one.values["at"], one.weight) for one in variants), strict=True))
+    np.testing.assert_allclose(weight[1:-1] / weight[1], (at[2:] - at[:-2]) / (at[2] - at[0]), rtol=1e-9)
+    assert weight.mean() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("at", [1_337.0, 1_350.0, 1_359.0])
+def test_a_large_jump_is_found_at_any_time_of_a_long_record(at):
+    blocks = 2_000
+    windows = 20.0 * np.arange(blocks)
+    means = np.random.default_rng(2).standard_normal(blocks) + 30.0 * np.clip((windows + 20.0 - at) / 20.0, 0.0, 1.0)
+    frame = Windows(windows, windows + 20.0, np.ones(1), 10.0, ("x",), own={"x": means})
+    possible = np.unique(np.concatenate([windows[1:], windows + 10.0]))
+    tried = np.array(tried_instants(possible, frame))
+    assert tried.size < 350
+    assert np.abs(tried - at).min() <= 5.0
+
+
+def test_two_restarts_share_their_weight(restarted):
+    twice = restarted.drop_vars(["restart_begin", "restart_end"])
+    twice = twice.assign(restart_begin=("restart", [900.0, _BACK]), restart_end=("restart", [905.0, _BACK + 7.0]))
+    variants = _jumps(twice).variants
+    weight = np.array([one.weight for one in variants])
+    known = np.array([one.values["at"] in (905.0, _BACK + 7.0) for one in variants])
+    assert known.sum() == 2
+    assert weight[known].sum() == pytest.approx(weight[~known].sum())
+
+
+def test_a_jump_where_power_came_back_needs_less_to_be_seen(restarted):
+    middle = (restarted["begin"] + restarted["end"]) / 2.0
+    moved = restarted.assign(mean=restarted["mean"] + 0.08 * (middle > _BACK))
+    state = begin_state(moved, calibrate(moved))
+    weighed = _jumps(moved)
+    alike = replace(weighed, variants=tuple(replace(one, weight=1.0) for one in weighed.variants))
+    found = [gains([one], moved, state, fold_blocks(moved))[0] for one in (weighed, alike)]
+    assert (found[0].gain > found[1].gain + 0.5).any()
+    assert {one.values["at"] for one in found[0].best} == {_BACK}

@@ -1,0 +1,195 @@
+"""Which of the effects in the place of a mismatch it takes to explain it: by what is left when one is taken out."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.nulls.scores import null_scores
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.predict.condition import Part, explain_away, odd_blocks
+from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.result.attribution import explanations
+from gyrostab.diagnose.result.attribution_weights import needed
+from gyrostab.diagnose.statistics import mean
+from tests.support.named import COEFFICIENT, nulls, record
+
+NAMES = (("vibration_noise", "power", "white"), ("vibration_rectification", "mean", "sensitivity"), ("spikes", "marks", "outliers"))
+
+
+def _claim(candidates, effect, view, column):
+    one = next(one for one in candidates if (one.effect, one.view) == (effect, view))
+    variant = next(one for one in one.variants if one.columns == (column,) and one.values.get("exponent", 1.0) == 1.0)
+    return Claim(effect, one.driver, ("x",), (Part(one, variant, ("x",), 50.0),), 50.0, 8.0)
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    """Vibration that raises noise and bias of x, with the spikes of a few blocks in it; three claims; and what null records do."""
+    reduced = record([])
+    g = reduced["channel_vibration"].values
+    baseline, chance = nulls(reduced, 60)
+    level = np.zeros((3, g.size))
+    level[0] = 0.05 * g**2
+    spiky = np.zeros((3, g.size), np.int64)
+    spiky[0, np.flatnonzero(g > 1.0)[[4, 9]]] = 9
+    changed = reduced.assign(
+        power=reduced["power"] * (1.0 + level[..., None] + 20.0 * (spiky > 0)[..., None]),
+        mean=reduced["mean"] + np.stack([0.004 * g**2, 0 * g, 0 * g]),
+        outliers=(("axis", "block"), spiky),
+    )
+    candidates, reasons = effect_candidates(changed, COEFFICIENT)
+    claims = tuple(_claim(candidates, *names) for names in NAMES)
+    state = begin_state(changed, baseline)
+    for claim in claims[::-1]:  # odd samples are named first
+        state = explain_away(state, list(claim.parts))
+    naming = Naming(claims, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed))
+    return changed, baseline, naming, null_scores(baseline, chance)
+
+
+def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(shaken):
+    reduced, baseline, naming, _ = shaken
+    loud, bias, _ = naming.claims
+    whole, silent, level = (predicted(naming, baseline, left_out=out) for out in ([], [loud], [bias]))
+    quiet = reduced["channel_vibration"].values < 1.0
+    np.testing.assert_allclose(silent["known_mean"], whole["known_mean"])
+    np.testing.assert_allclose(level["spectrum"], whole["spectrum"])
+    np.testing.assert_allclose(level["known_mean"], baseline["known_mean"].transpose("axis", "block"))
+    np.testing.assert_allclose(silent["spectrum"][0][quiet], whole["spectrum"][0][quiet], rtol=0.02)
+    ratio = (whole["spectrum"] / silent["spectrum"]).values[0, ~quiet, -1]
+    np.testing.assert_allclose(ratio, 1.0 + 0.05 * reduced["channel_vibration"].values[~quiet] ** 2, rtol=0.15)
+    np.testing.assert_allclose((silent["spectrum"] / baseline["spectrum"])[0], 1.0, atol=0.2)
+
+
+def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
+    reduced, baseline, naming, null = shaken
+    found = locate(reduced, baseline, null)
+    after = predicted(naming, baseline)
+
+    def told(view, **options):
+        lists = explanations(found, naming.claims, reduced, after, null, level=0.005, **options)
+        return {frozenset(names) for box, names in zip(found["view"].values, lists, strict=True) if box == view}
+
+    def without(out):
+        return predicted(naming, baseline, left_out=out)
+
+    assert {"vibration_noise", "vibration_rectification", "spikes"} in told("davar")
+    noise = told("davar", without=without)
+    assert noise
+    assert set().union(*noise) == {"vibration_noise", "spikes"}
+    assert told("mean", without=without) == {frozenset({"vibration_rectification"})}
+
+
+def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
+    reduced, baseline, naming, null = shaken
+    loud, _, spikes = naming.claims
+    assert odd_blocks(spikes.parts[0], reduced).sum() == 2
+    found = locate(reduced, baseline, null)
+    after = predicted(naming, baseline)
+    one = explanations(found, [loud], reduced, after, null, level=0.005)  # the loudest two blocks are still there
+    both = explanations(found, naming.claims, reduced, after, null, level=0.005)
+    davar = found["view"].values.tolist().index("davar")
+    assert (one[davar], "vibration_noise" in both[davar]) == ([], True)
+
+
+@pytest.mark.parametrize(("step", "told"), [(0.3, ["bias_jump"]), (0.0, [])])
+def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
+    """The constant of a record is free, so that the mean before a jump stands out as well as that after it."""
+    _, baseline, _, null = shaken
+    reduced = record([])
+    after_it = reduced["begin"].values >= 1800.0
+    moved = reduced.assign(mean=reduced["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it]))
+    candidates, reasons = effect_candidates(moved, COEFFICIENT)
+    one = next(one for one in candidates if (one.effect, one.view) == ("bias_jump", "mean"))
+    variant = next(variant for variant in one.variants if variant.values["at"] == 1800.0)
+    claim = Claim("bias_jump", one.driver, ("x",), (Part(one, variant, ("x",), 50.0),), 50.0, 8.0)
+    state = explain_away(begin_state(moved, baseline), list(claim.parts))
+    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(moved))
+    fields = {"view": "mean", "axes": "x", "what": "mean", "begin": 1200.0, "end": 1800.0, "tau_min_s": 20.0, "tau_max_s": 600.0}
+    fields |= {"frequency": np.nan, "sign": -1, "z": -8.0}
+    box = xr.Dataset({name: ("mismatch", [value]) for name, value in fields.items()})
+    assert mean.score(moved, baseline)["what"].values.tolist() == ["mean"]
+
+    def explained(**options):
+        return explanations(box, [claim], moved, predicted(naming, baseline), null, level=0.005, **options)[0]
+
+    assert explained() == []  # by its time alone
+    assert explained(without=lambda out: predicted(naming, baseline, left_out=out)) == told
+
+
+BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
+
+
+def _shown(*views):
+    variant = SimpleNamespace(columns=("white",))
+    return [(f"effect {n}", [SimpleNamespace(candidate=SimpleNamespace(view=view), variant=variant)]) for n, view in enumerate(views)]
+
+
+def _brought(**sizes):
+    """What is left, of scores that add, beside 1; a mismatch from 6 on."""
+
+    def left(out):
+        return 1.0 + sum(sizes[one.replace(" ", "_")] for one in out), 6.0
+
+    return left
+
+
+@pytest.mark.parametrize(
+    ("sizes", "kept"),
+    [
+        ((18.0, 0.4), [0]),  # the second is not missed
+        ((12.0, 6.0), [0, 1]),  # without any of the two it is a mismatch
+        ((4.0, 3.5), [0, 1]),  # without none alone, and both do alike
+        ((4.5, 1.0), [0]),
+        ((0.0, 0.0), [0]),  # one of them does it for the two
+    ],
+)
+def test_an_effect_is_needed_without_which_it_is_a_mismatch_or_that_brings_a_fair_share(sizes, kept):
+    shown = _shown("power", "mean")
+    found = needed(BOX, shown, _brought(effect_0=sizes[0], effect_1=sizes[1]))
+    assert found == [f"effect {number}" for number in kept]
+
+
+def test_what_a_view_does_not_hold_stays():
+    assert needed(BOX | {"view": "spectrum"}, _shown("power", "line"), _brought(effect_0=0.0, effect_1=0.0)) == ["effect 0", "effect 1"]
+    assert needed(BOX, _shown("power", "wander"), _brought(effect_0=9.0, effect_1=0.0)) == ["effect 0", "effect 1"]
+    low_pass = _shown("power", "power")
+    low_pass[1][1][0].variant = SimpleNamespace(columns=())
+    assert needed(BOX, low_pass, _brought(effect_0=9.0, effect_1=0.0)) == ["effect 0", "effect 1"]
+
+
+@pytest.mark.parametrize(("begin", "boxes"), [(70.0, 2), (85.0, 1)])
+def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near(begin, boxes):
+    long = {"view": "davar", "axes": "x y", "what": "level", "begin": 100.0, "end": 400.0, "tau_min_s": 0.01, "tau_max_s": 2.0}
+    long |= {"frequency": float("nan"), "sign": 1, "z": 90.0, "p_value": 1e-9}
+    short = long | {"axes": "x", "begin": begin, "end": begin + 10.0, "z": 80.0}
+    assert len(merged([long, short])) == boxes
+
+
+@pytest.mark.parametrize(("axes", "told"), [("xy", ["spectral_line"]), ("x", [])])
+def test_a_line_on_two_axes_is_why_they_vary_together(shaken, axes, told):
+    _, baseline, _, null = shaken
+    quiet = record([])
+    band = int(np.flatnonzero(quiet["band_low"].values < 2.0)[-1])
+    level = np.sqrt((baseline["spectrum"][0] * baseline["spectrum"][1]).transpose("block", "band").values[:, band])
+    cross = quiet["cross"].transpose("pair", "block", "band").copy()
+    pair = [(str(a), str(b)) for a, b in zip(quiet["first"].values, quiet["second"].values, strict=True)].index(("x", "y"))
+    cross.values[pair, :, band] += 0.5 * level
+    shared = quiet.assign(cross=cross)
+    place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
+    candidates, _ = effect_candidates(shared, COEFFICIENT)
+    one = next(one for one in candidates if (one.effect, one.view) == ("spectral_line", "line"))
+    claim = Claim("spectral_line", (), tuple(axes), tuple(Part(one, one.variants[0], (axis,), 50.0, place) for axis in axes), 50.0, 8.0)
+    found = locate(shared, baseline, null)
+    found = found.isel(mismatch=found["view"].values == "cross_axis")
+    assert found.sizes["mismatch"] >= 1
+    lists = explanations(found, [claim], shared, baseline, null, level=0.005)
+    assert all(names == told for names in lists)

@@ -1,0 +1,390 @@
+"""A diagnosis as data and as files: the contract's JSON to the letter, the model that runs, the folder, the page."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import tomllib
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab.diagnose.result.diagnosis import VERDICTS, Diagnosis, check_diagnosis, effect_table, model_text, plain
+from gyrostab.diagnose.result.text import (
+    chance,
+    clock,
+    mismatch_statement,
+    next_measurement,
+    plain_name,
+    summary,
+    unsized_statement,
+)
+from gyrostab.errors import FormatError, OutputError, SchemaError
+from gyrostab.physics.registry import effects, make_effect
+from gyrostab.report import write_diagnosis_report
+from gyrostab.report.diagnosis_folder import FILES, open_diagnosis, write_diagnosis
+from gyrostab.simulate import read_model, simulate
+from tests.support.command_line import call
+from tests.support.diagnosed import content, diagnosis, model, surfaces
+
+
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages of words alone, for tests that are about something else."""
+    monkeypatch.setattr("gyrostab.report.diagnosis._figures", lambda _: [])
+
+
+plain_pages = pytest.mark.usefixtures("without_figures")
+
+# ------------------------------------------------------------------------------------------------------------------- schema
+
+
+def test_what_is_made_by_hand_after_the_contract_passes():
+    check_diagnosis(content())
+    check_diagnosis(json.loads(diagnosis().to_json()))
+
+
+def test_every_key_is_explained_on_the_page():
+    text = (Path(__file__).resolve().parents[3] / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    section = text[text.index("## What stands in `diagnosis.json`") :].split("\n## ")[0]
+    keys = {str(key) for place in _places(content()) for key in place[-1:] if isinstance(key, str)}
+    assert keys > {"verdict", "held_out", "nats"}
+    assert not [key for key in [*keys, *VERDICTS] if f"`{key}`" not in section]
+
+
+def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every key of the content, apart from what may have any name."""
+    found = []
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in items:
+        free = (place and place[-1] in ("noise", "parameters", "not_found")) or (len(place) > 1 and place[-2] == "noise")
+        if isinstance(value, dict) and not free:
+            found.append((*place, key))
+        found += _places(item, (*place, key))
+    return found
+
+
+@pytest.mark.parametrize("place", _places(content()), ids=lambda place: ".".join(map(str, place)))
+def test_nothing_may_be_left_out_or_be_of_another_kind(place: tuple[Any, ...]):
+    optional = place == ("unused_channels",)  # files of earlier versions have none
+    for spoil in ("other kind",) if optional else ("leave out", "other kind"):
+        spoiled = content()
+        table: Any = spoiled
+        for key in place[:-1]:
+            table = table[key]
+        if spoil == "leave out":
+            del table[place[-1]]
+        else:
+            table[place[-1]] = object()
+        with pytest.raises(SchemaError):
+            check_diagnosis(spoiled)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda c: c.update(verdict="fine"), "the verdict is 'fine'"),
+        (lambda c: c.update(schema="gyrostab.diagnosis/9"), "expected 'gyrostab.diagnosis/1'"),
+        (lambda c: c["mismatches"][0].update(view="taste"), "view is 'taste'"),
+        (lambda c: c["mismatches"][0].update(p_value=1.5), "no probability"),
+        (lambda c: c["mismatches"][0].update(explained_by=["shupe"]), "'shupe', which is not among the effects"),
+        (lambda c: c["mismatches"][1].update(id=1), "each must be there once"),
+        (lambda c: c["mismatches"][0].update(start="yesterday"), "no time of ISO 8601"),
+        (lambda c: c.update(unexplained=[7]), "mismatch 7"),
+        (lambda c: c["baseline"].update(source="guess"), "'guess'"),
+        (lambda c: c["effects"][0]["parameters"]["white"].pop("low"), "white.low"),
+    ],
+)
+def test_what_contradicts_itself_is_named(change, complaint: str):
+    spoiled = content()
+    change(spoiled)
+    with pytest.raises(SchemaError, match=re.escape(complaint)):
+        check_diagnosis(spoiled)
+
+
+def test_json_knows_no_infinities():
+    assert json.loads(json.dumps(plain({"a": np.array([1.0, np.inf]), "b": np.bool_(True), "c": (np.float32(2),)}))) == {
+        "a": [1.0, None],
+        "b": True,
+        "c": [2.0],
+    }
+    broken = Diagnosis({**content(), "seconds": float("nan")}, surfaces(), model())
+    with pytest.raises(ValueError, match="JSON"):
+        broken.to_json()
+
+
+# -------------------------------------------------------------------------------------------------------------------- model
+
+
+@pytest.mark.parametrize("name", list(effects()))
+def test_every_effect_comes_back_from_its_table(name: str):
+    kind = effects()[name]
+    effect = kind.example(axes=("x", "y"))
+    written = model_text({"noise": {"N": 0.003}, "effect": [effect_table(effect)]})
+    assert read_model(tomllib.loads(written)).effects == (effect,)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    noise=st.dictionaries(st.sampled_from("QNBK"), st.floats(0.0, 1e6), min_size=1),
+    axes=st.lists(st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=6), min_size=1, unique=True),
+)
+def test_models_are_valid_toml_with_the_same_numbers(noise: dict[str, float], axes: list[str]):
+    tables = {"noise": {axis: noise for axis in axes}, "effect": [{"name": "warm_up", "axes": axes, "amplitude": 0.1}]}
+    assert tomllib.loads(model_text(tables, heading="made\nby hand")) == tables
+
+
+@plain_pages
+def test_the_model_runs(tmp_path: Path):
+    folder = tmp_path / "found"
+    write_diagnosis(diagnosis(), folder)
+    world = [{"profile": "vibration", "points": [[0, 0.02], [60, 6.0]]}]
+    given_model = tomllib.loads((folder / "model.toml").read_text()) | {"environment": world}
+    log = simulate(given_model, duration="2min", rate=50.0, seed=1).compute()
+    quiet, loud = log.rate.sel(axis="x").values[:3000], log.rate.sel(axis="x").values[3000:]
+    assert loud.std() > 1.2 * quiet.std()
+    assert loud.mean() - quiet.mean() == pytest.approx(0.0022 * (6.0**2 - 0.02**2), abs=0.06)
+
+
+# -------------------------------------------------------------------------------------------------------------------- files
+
+
+@plain_pages
+def test_a_folder_holds_the_four_files_and_comes_back(tmp_path: Path):
+    made = diagnosis()
+    files = write_diagnosis(made, tmp_path / "found")
+    assert [path.name for path in files] == list(FILES)
+    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == sorted(FILES)
+    assert [path.name for path in tmp_path.iterdir()] == ["found"]
+    again = open_diagnosis(tmp_path / "found")
+    assert again.content == json.loads(made.to_json())
+    assert again.model == made.model
+    for name in made.surfaces.data_vars:
+        np.testing.assert_array_equal(
+            again.surfaces[name].transpose(*made.surfaces[name].dims).values, made.surfaces[name].values, err_msg=str(name)
+        )
+
+
+@plain_pages
+def test_a_folder_is_replaced_only_when_asked_and_only_when_it_is_one(tmp_path: Path):
+    folder = tmp_path / "found"
+    write_diagnosis(diagnosis(), folder)
+    with pytest.raises(OutputError, match="--overwrite"):
+        write_diagnosis(diagnosis(), folder)
+    write_diagnosis(diagnosis(), folder, overwrite=True)
+    (folder / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputError, match=r"thesis\.tex"):
+        write_diagnosis(diagnosis(), folder, overwrite=True)
+    assert (folder / "thesis.tex").exists()
+    with pytest.raises(OutputError, match="is a file"):
+        write_diagnosis(diagnosis(), folder / "thesis.tex", overwrite=True)
+    with pytest.raises(OutputError, match="no directory"):
+        write_diagnosis(diagnosis(), tmp_path / "not" / "there")
+
+
+@plain_pages
+def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("gyrostab.report.diagnosis_folder.to_netcdf", fail)
+    with pytest.raises(OutputError):
+        write_diagnosis(diagnosis(), tmp_path / "found")
+    assert list(tmp_path.iterdir()) == []
+
+
+@plain_pages
+def test_a_content_that_does_not_pass_is_not_written(tmp_path: Path):
+    spoiled = copy.deepcopy(content())
+    del spoiled["held_out"]
+    with pytest.raises(SchemaError, match="held_out"):
+        write_diagnosis(Diagnosis(spoiled, surfaces(), model()), tmp_path / "found")
+    assert list(tmp_path.iterdir()) == []
+
+
+@plain_pages
+@pytest.mark.parametrize("spoil", ["missing", "no JSON", "other JSON"])
+def test_what_is_no_diagnosis_is_said(tmp_path: Path, spoil: str):
+    folder = tmp_path / "found"
+    folder.mkdir()
+    if spoil != "missing":
+        (folder / "diagnosis.json").write_text("{" if spoil == "no JSON" else "{}")
+    with pytest.raises(FormatError, match="found"):
+        open_diagnosis(folder)
+
+
+# --------------------------------------------------------------------------------------------------------------------- page
+
+
+class Page(HTMLParser):
+    """Text, pictures and foreign addresses of a page; complains about tags that do not close."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.words: list[str] = []
+        self.pictures: list[str] = []
+        self.addresses: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given_attrs = dict(attrs)
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+        self.addresses += [str(given_attrs[name]) for name in ("src", "href") if name in given_attrs]
+        if tag == "img":
+            self.pictures.append(str(given_attrs["alt"]))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> Page:
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    write_diagnosis_report(diagnosis(), path)
+    return Page(path.read_text(encoding="utf-8"))
+
+
+def test_the_page_needs_nothing_beside_it(page: Page):
+    assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
+    assert len(page.pictures) == 5
+    assert page.pictures[0] == "Recording, simulation before and after"
+
+
+def test_the_page_says_what_where_when_how_much_how_sure_what_else_and_what_next(page: Page):
+    text = re.sub(r"\s+", " ", " ".join(page.words))
+    for piece in (
+        "Noise that rises with vibration, axis x",
+        "25:00 to 30:00 after the start",
+        "1.8 times the expected one",
+        "1 of 2 500",
+        "0.00045",
+        "31 ± 6 nats",
+        "a bias that follows acceleration (g_sensitivity)",
+        "repeat at twice the vibration",
+        "no temperature channel",
+        "gyrostab simulate model.toml --like RECORDING",
+    ):
+        assert piece in text, piece
+
+
+@plain_pages
+def test_a_page_without_findings_says_so(tmp_path: Path):
+    nothing = content() | {"verdict": "no mismatch", "mismatches": [], "effects": [], "unexplained": []}
+    write_diagnosis_report(Diagnosis(nothing, surfaces(), {"noise": {}}), tmp_path / "report.html")
+    text = " ".join(Page((tmp_path / "report.html").read_text(encoding="utf-8")).words)
+    assert "nothing differs from the simulation" in text
+    assert "Nowhere" in text
+
+
+@plain_pages
+def test_the_page_escapes_names(tmp_path: Path):
+    odd = content()
+    odd["recording"]["files"] = ["<script>alert(1)</script>"]
+    write_diagnosis_report(Diagnosis(odd, surfaces(), model()), tmp_path / "report.html")
+    assert "<script>" not in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("axes", ["x", "xyz"])
+def test_the_page_takes_any_number_of_axes(tmp_path: Path, axes: str):
+    one = content()
+    one["recording"]["axes"] = list(axes)
+    page = write_diagnosis_report(Diagnosis(one, surfaces(axes=axes), model()), tmp_path / "report.html")
+    assert page.read_text(encoding="utf-8").count("<img") == 5
+
+
+def test_the_command_report_takes_the_folder_too(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    write_diagnosis(diagnosis(), tmp_path / "found")
+    assert call("report", tmp_path / "found", "-o", tmp_path / "again.html", "--quiet-progress") == 0
+    assert "Gyro diagnosis" in (tmp_path / "again.html").read_text(encoding="utf-8")
+    capfd.readouterr()
+    assert call("report", tmp_path / "found", "-o", tmp_path / "again.html") == 2
+    assert "--overwrite" in capfd.readouterr().err
+    assert call("report", tmp_path / "found", "-o", tmp_path / "other.html", "--log", "x.nc") == 2
+
+
+# ---------------------------------------------------------------------------------------------------------------- sentences
+
+
+def test_every_effect_has_a_plain_name_and_a_next_measurement():
+    for name in effects():
+        assert plain_name(name) != name.replace("_", " "), name
+        assert next_measurement(name, []).startswith("To confirm it, "), name
+    assert next_measurement("vibration_noise", ["real_motion"]).startswith("To tell them apart, ")
+    assert next_measurement("no_such_effect", []) == ""
+
+
+@pytest.mark.parametrize("view", ["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"])
+@pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
+def test_every_view_has_a_sentence(view: str, axes: list[str]):
+    box = {
+        "view": view, "what": "outliers", "axes": axes, "begin": 0.0, "end": 3600.0, "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
+        "sign": -1, "p_value": 0.002, "estimate": -0.2, "frequency": 13.0,
+    }  # fmt: skip
+    sentence = mismatch_statement(box, 3600.0)
+    assert sentence[0].isupper()
+    assert sentence.endswith(".")
+    assert "1 of 500" in sentence
+    assert "nan" not in sentence
+    for axis in axes:
+        assert re.search(rf"\b{axis}\b", sentence)
+
+
+def test_numbers_are_said_as_people_say_them():
+    assert clock(3599.96) == "1:00:00"
+    assert chance(0.03) == "noise alone does that in 1 of 33 such records"
+    assert chance(0.0000123).endswith("1 of 81 000 such records")
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_has_a_summary(verdict: str):
+    one = content() | {"verdict": verdict}
+    if verdict in ("no mismatch", "unknown"):
+        one |= {"effects": []}
+    if verdict == "no mismatch":
+        one |= {"mismatches": []}
+    if verdict == "partly explained":
+        one |= {"unexplained": [1]}
+    text = summary(one)
+    assert text.endswith(".")
+    assert ("vibration" in text) == (verdict in ("explained", "partly explained"))
+
+
+def test_a_diagnosis_prints_its_verdict_and_sentences():
+    text = str(diagnosis())
+    assert text.startswith("explained: There are 2 places")
+    assert "- vibration_noise: Vibration raises the noise" in text
+    assert make_effect({"name": "vibration_noise", "white": 0.00045, "axes": ["x"]}).say({"white": 2.25e-5}) in text
+
+
+@plain_pages
+def test_a_page_of_many_mismatches_gives_their_chance_in_a_column(tmp_path: Path):
+    """24 places: the words on chance are said once for all of them, and each has its number."""
+    one = diagnosis()
+    box = one.content["mismatches"][0] | {"p_value": 1e-12, "explained_by": []}
+    box["statement"] = "Axis x is noisier than simulated (noise alone does that in fewer than 1 of a million such records)."
+    boxes = [box | {"id": number} for number in range(1, 25)]
+    many = replace(one, content=one.content | {"mismatches": boxes, "unexplained": list(range(1, 25)), "effects": []})
+    text = write_diagnosis_report(many, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert text.count("<td>fewer than 1 of a million</td>") == 24
+    assert "noise alone does that" not in text
+    assert str(many).count("of a million") == 1
+
+
+def test_effects_without_a_size_have_a_whole_sentence():
+    motion = make_effect({"name": "real_motion", "x": 0.02, "axes": ["z"]})
+    assert motion.say() == "The tool really rotates on axis z: tilt 0.02 mrad/g along x."
+    text = unsized_statement("real_motion", ["x", "z"])
+    assert text == "The record shows real rotation of the tool, not a sensor error, on axes x and z. It does not give a size."

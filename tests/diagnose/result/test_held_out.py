@@ -1,0 +1,259 @@
+"""What effects are worth on time that was held out, against closed forms; and the surfaces side by side."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.result.held_out import held_out, log_likelihood, stretches
+from gyrostab.diagnose.result.surfaces import CASES, make_surfaces
+from gyrostab.errors import OptionError
+from gyrostab.noise import LAWS
+from tests.support.reduced_records import BLOCK_S, RATE, baseline, records
+
+LEVEL = 3600.0 * 0.003**2
+VARIANCE = LEVEL / BLOCK_S
+ON = slice(60, 90)
+
+
+def _record(seed=1, **options):
+    base = baseline(**options)
+    return base, records(base, 1, np.random.default_rng(seed)).isel(record=0)
+
+
+def _with_effects(base, *, epsilon=0.0, height=0.0):
+    after = base.copy(deep=True)
+    after["spectrum"][0, ON] *= 1.0 + epsilon
+    after["known_mean"][1, ON] += height
+    return after
+
+
+def _add_effects(found, *, epsilon=0.0, height=0.0):
+    found["power"][0, ON] *= 1.0 + epsilon
+    found["mean"][1, ON] += height
+
+
+def test_without_effects_nothing_is_gained_and_the_simulation_fits():
+    base, found = _record()
+    result = held_out(found, base, base)
+    assert result["log_likelihood_gain"] == 0.0
+    assert result["forecast_gain"] == 0.0
+    assert result["misfit_before"] == result["misfit_after"]
+    assert result["blocks"] == 36
+    several = [held_out(found, base, base) for _, found in map(_record, (11, 12, 13))]
+    assert np.mean([one["misfit_before"] for one in several]) == pytest.approx(1.0, abs=0.06)
+    assert 0.94 < np.mean([one["coverage95_before"] for one in several]) < 0.96
+    assert np.mean([one["mean_misfit_before"] for one in several]) == pytest.approx(1.0, abs=0.4)
+
+
+def test_raised_noise_gains_what_the_gamma_law_says():
+    base, found = _record(2)
+    epsilon = 0.2
+    _add_effects(found, epsilon=epsilon)
+    result = held_out(found, base, _with_effects(base, epsilon=epsilon))
+    shape = found["shape"].values[0, ON].sum()
+    expected = shape * (epsilon - np.log1p(epsilon))
+    scatter = np.sqrt(shape) * epsilon  # of sum n (P / S) epsilon / (1 + epsilon)
+    assert result["log_likelihood_gain"] == pytest.approx(expected, abs=4.0 * scatter)
+    assert result["log_likelihood_gain"] > 0.7 * expected
+    assert result["stderr"] == pytest.approx(scatter, rel=0.25)
+    assert result["misfit_before"] > result["misfit_after"] + 0.3
+    assert result["coverage95_before"] < 0.93 < result["coverage95_after"] < 0.97
+
+
+def test_a_mean_gains_what_the_normal_law_says():
+    base, found = _record(3)
+    height = 0.15
+    _add_effects(found, height=height)
+    result = held_out(found, base, _with_effects(base, height=height))
+    expected = 0.5 * height**2 / VARIANCE * 30 * (1.0 - 30.0 / 180.0)
+    assert result["log_likelihood_gain"] == pytest.approx(expected, rel=0.35)
+    assert result["mean_misfit_before"] > 3.0 * result["mean_misfit_after"]
+    assert result["misfit_after"] == pytest.approx(1.0, abs=0.12)
+
+
+def test_the_error_of_a_gain_is_its_scatter_over_records():
+    gains, errors = [], []
+    for seed in range(16):
+        base, found = _record(200 + seed)
+        _add_effects(found, epsilon=0.15, height=0.1)
+        result = held_out(found, base, _with_effects(base, epsilon=0.15, height=0.1))
+        gains.append(result["log_likelihood_gain"])
+        errors.append(result["stderr"])
+    assert 0.6 < np.std(gains, ddof=1) / np.mean(errors) < 1.6
+
+
+def test_held_out_means_have_the_density_of_dense_algebra():
+    base, found = _record(4)
+    known = np.ones(180, dtype=bool)
+    known[40:52] = False
+    known[100:110] = False  # held out by another stretch of the same fold
+    twice = base.assign(mean_variance=base["mean_variance"] * 2.0)
+    held = (np.arange(180) >= 40) & (np.arange(180) < 52)
+    seen = log_likelihood(found, twice, known, held) - log_likelihood(found, base, known, held)
+    dense = 0.0
+    for axis in range(3):
+        y, rest = found["mean"].values[axis, 40:52], found["mean"].values[axis, known]
+        for factor, sign in ((2.0, 1.0), (1.0, -1.0)):
+            covariance = factor * VARIANCE * (np.eye(12) + 1.0 / rest.size)
+            away = y - rest.mean()
+            dense += -0.5 * sign * (away @ np.linalg.solve(covariance, away) + np.linalg.slogdet(covariance)[1])
+    assert seen == pytest.approx(dense, rel=1e-6)
+
+
+def test_cross_spectra_have_the_density_of_the_wishart_law():
+    base = baseline(axes="xy")
+    found = records(base, 1, np.random.default_rng(5)).isel(record=0)
+    share = 0.3
+    found["cross"] = found["cross"] + share * LEVEL
+    after = base.copy()
+    after["cross"] = (("pair", "block", "band"), np.full(found["cross"].shape, share * LEVEL + 0j))
+    known = np.ones(180, dtype=bool)
+    known[20:30] = False
+    seen = log_likelihood(found, after, known, ~known) - log_likelihood(found, base, known, ~known)
+    model = LEVEL * np.array([[1.0, share], [share, 1.0]])
+    expected = 0.0
+    for block in range(20, 30):
+        for band in range(found.sizes["band"]):
+            c = complex(found["cross"].values[0, block, band])
+            powers = found["power"].values[:, block, band]
+            w = np.array([[powers[0], c], [c.conjugate(), powers[1]]])
+            n = found["shape"].values[0, block, band]
+            for s, sign in ((model, 1.0), (LEVEL * np.eye(2), -1.0)):
+                expected -= sign * n * (np.linalg.slogdet(s)[1] + np.trace(np.linalg.solve(s, w)).real)
+    assert seen == pytest.approx(expected, rel=1e-9)
+    assert seen > 0.0
+
+
+def test_models_never_see_what_they_are_judged_on():
+    base, found = _record(6)
+    seen: list[np.ndarray] = []
+
+    def train(known):
+        seen.append(known.copy())
+        return base
+
+    held_out(found, base, train)
+    folds, forecast = seen[:4], seen[4]
+    assert np.sum([~known for known in folds], axis=0).tolist() == [1] * 180  # each block is held out once
+    assert forecast[:126].all()
+    assert not forecast[126:].any()
+
+
+def test_a_sham_effect_fitted_to_noise_loses():
+    """An effect whose size is fitted to the rest of the record gains nothing on held-out time where it is not there."""
+    gains = []
+    for seed in range(8):
+        base, found = _record(100 + seed)
+        template = np.sin(np.arange(180) / 9.0)
+
+        def fit(known, base=base, found=found, template=template):
+            x, y = template[known] - template[known].mean(), found["mean"].values[0, known]
+            after = base.copy(deep=True)
+            after["known_mean"][0] = (x @ y) / (x @ x) * template
+            return after
+
+        gains.append(held_out(found, base, fit)["log_likelihood_gain"])
+    assert np.mean(gains) < 0.1
+    assert max(gains) < 4.0
+
+
+@pytest.mark.parametrize(("period", "best"), [(36, 18), (180, 45)])  # blocks
+def test_a_slow_drift_in_a_random_walk_is_worth_more_on_long_stretches(period, best):
+    base, found = _record(9, walk=0.1)
+    after = base.copy(deep=True)
+    drift = 0.3 * np.sin(2.0 * np.pi * np.arange(180) / period)
+    found["mean"][0] += drift
+    after["known_mean"][0] += drift
+
+    def on(length):
+        fold = np.arange(180) // length % 4
+        return sum(log_likelihood(found, after, fold != k, fold == k) - log_likelihood(found, base, fold != k, fold == k) for k in range(4))
+
+    gain = held_out(found, base, after)["log_likelihood_gain"]
+    assert gain == pytest.approx(on(best))
+    assert on(best) == max(on(5), on(18), on(45))
+    assert gain > on(5) + 1.0
+
+
+def test_a_forecast_gains_where_the_effect_goes_on():
+    base, found = _record(7)
+    after = base.copy(deep=True)
+    wave = 0.1 * np.sin(2.0 * np.pi * np.arange(180) / 60.0)
+    found["mean"][0] += wave
+    after["known_mean"][0] += wave
+    gain = held_out(found, base, after)["forecast_gain"]
+    tail = wave[126:]
+    assert gain == pytest.approx(0.5 * (tail**2).sum() / VARIANCE, rel=0.5)
+
+
+def test_gain_of_other_views_is_added():
+    base, found = _record()
+    result = held_out(found, base, base, more_gain=3.5)
+    assert (result["log_likelihood_gain"], result["stderr"]) == (3.5, pytest.approx(np.sqrt(7.0)))
+
+
+def test_the_allan_variance_is_compared_with_the_model_that_is_shown():
+    base, found = _record()
+    _add_effects(found, epsilon=0.5)
+    whole = _with_effects(base, epsilon=0.5)
+    seen, blind = held_out(found, base, base, more_gain=3.5, shown=whole), held_out(found, base, base, more_gain=3.5)
+    assert seen["log_likelihood_gain"] == blind["log_likelihood_gain"] == pytest.approx(3.5)
+    assert abs(seen["misfit_after"] - 1.0) < 0.3 * abs(blind["misfit_after"] - 1.0)
+
+
+def test_stretches_cover_the_record_once_and_short_records_are_refused():
+    _, found = _record()
+    cut = stretches(found)
+    assert cut.first[0] == 0
+    assert cut.stop[-1] == 180
+    np.testing.assert_array_equal(cut.stop[:-1], cut.first[1:])
+    with pytest.raises(OptionError, match="10 blocks, too few"):
+        stretches(found.isel(block=slice(10)))
+
+
+def test_gaps_leave_the_coverage_as_it_is():
+    base = baseline(missing=0.3)
+    found = records(base, 1, np.random.default_rng(8), missing=0.3).isel(record=0)
+    for name in ("mean", "power", "kurtosis"):
+        found[name][:, 30:50] = np.nan
+    found["samples"] = found["samples"].where((np.arange(180) < 30) | (np.arange(180) >= 50), 0)
+    result = held_out(found, base, base)
+    assert 0.93 < result["coverage95_before"] < 0.97
+    assert np.isfinite(list(result.values())).all()
+
+
+def test_surfaces_stand_side_by_side():
+    base, found = _record(9)
+    _add_effects(found, epsilon=0.5, height=0.4)
+    surfaces = make_surfaces(found, base, _with_effects(base, epsilon=0.5, height=0.4))
+    assert surfaces["case"].values.tolist() == list(CASES)
+    assert surfaces["avar"].dims == ("case", "axis", "window", "tau")
+    quiet = surfaces.sel(case="before").isel(axis=2)
+    np.testing.assert_allclose(quiet["avar"].isel(window=0), LAWS["N"].avar(quiet["tau"].values, 0.003), rtol=0.02)
+    recorded, after, before = (surfaces.sel(case=case) for case in CASES[:1] + CASES[:0:-1])
+    inside = (recorded["avar"] > after["avar_low"]) & (recorded["avar"] < after["avar_high"])
+    assert 0.92 < float(inside.where(recorded["avar"].notnull()).mean()) < 0.98
+    during = (surfaces["begin"] >= 60 * BLOCK_S) & (surfaces["end"] <= 90 * BLOCK_S)
+    low = surfaces["tau"] <= 1.0 / RATE
+    assert float(before["avar"].isel(axis=0).where(during & low).mean() * 1.5) == pytest.approx(
+        float(recorded["avar"].isel(axis=0).where(during & low).mean()), rel=0.03
+    )
+    step = after["mean"].isel(axis=1).where(during).mean() - after["mean"].isel(axis=1).where(surfaces["end"] <= 1200.0).mean()
+    assert float(step) == pytest.approx(0.4, abs=1e-6)
+    away = (recorded["mean"] - after["mean"]) / after["mean_stderr"]
+    assert float((away**2).mean()) < 2.0
+    # at the edge of the step the Allan variance of the known mean is in the expected one
+    edge = (surfaces["begin"] < 60 * BLOCK_S) & (surfaces["end"] > 60 * BLOCK_S) & (surfaces["end"] < 90 * BLOCK_S)
+    long = surfaces["tau"] >= BLOCK_S
+    assert float(after["avar"].isel(axis=1).where(edge & long).mean()) > 2.0 * float(before["avar"].isel(axis=1).where(edge & long).mean())
+
+
+def test_surfaces_of_a_long_record_stay_small():
+    base = baseline(blocks=1000)
+    found = records(base, 1, np.random.default_rng(1), blocks=1000).isel(record=0)
+    surfaces = make_surfaces(found, base, base)
+    assert surfaces.sizes["window"] <= 260
+    assert surfaces["time"].dtype.kind == "M"
+    assert isinstance(surfaces, xr.Dataset)

@@ -1,0 +1,208 @@
+"""What must hold before an effect is listed and before a record counts as explained."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import gyrostab
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_claims
+from gyrostab.diagnose.estimate.upper_limits import mixture_limit
+from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.designs import Candidate
+from gyrostab.diagnose.result import finish as conclude
+from gyrostab.diagnose.result.size_gate import supported_axes, with_supported_claims
+from gyrostab.diagnose.result.tables import effect_tables, unknown_tables
+from gyrostab.diagnose.result.text import summary
+from gyrostab.diagnose.result.verdict import decide_verdict, failed_checks
+from gyrostab.physics.registry import effects
+from tests.diagnose.estimate.test_recalibrate import SHAKE, naming_of, reduced_of
+from tests.support.diagnosed import content
+
+GOOD = {
+    "blocks": 36, "log_likelihood_gain": 41.2, "stderr": 6.0, "misfit_before": 3.1, "misfit_after": 1.0,
+    "coverage95_before": 0.71, "coverage95_after": 0.95, "forecast_gain": 12.0,
+}  # fmt: skip
+
+
+def estimate(value: float, error: float) -> Estimate:
+    return Estimate(value, error, value - 1.96 * error, value + 1.96 * error, "deg/h")
+
+
+def claim_of(effect: str, axes: str, gains: tuple[float, ...] | None = None, *, view: str = "mean") -> Claim:
+    one: Any = Candidate(effect, view, (), ())
+    variant: Any = SimpleNamespace(values={}, columns=())
+    parts = tuple(Part(one, variant, (axis,), gain) for axis, gain in zip(axes, gains or (20.0,) * len(axes), strict=True))
+    return Claim(effect, (), tuple(axes), parts, 20.0 * len(axes), 8.0)
+
+
+def naming_with(*claims: Claim) -> Naming:
+    return Naming(claims, (), 8.0, np.zeros(1), {}, (), *[None] * 2)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "axes"),
+    [
+        ({"sensitivity": estimate(0.4, 0.1)}, ("x", "y")),
+        ({"sensitivity": estimate(0.1, 0.1)}, ()),
+        ({"sensitivity.x": estimate(-0.4, 0.1), "sensitivity.y": estimate(0.1, 0.1)}, ("x",)),
+        ({"sensitivity": estimate(0.0, 0.0)}, ()),
+        ({"sensitivity": estimate(0.1, 0.1), "quadratic": estimate(0.5, 0.1)}, ("x", "y")),
+        ({"sensitivity": estimate(0.1, 0.1), "lag": estimate(60.0, 1.0)}, ()),
+        ({"sensitivity": Estimate(0.4, math.nan, math.nan, math.nan, "deg/h")}, ()),
+        ({}, ("x", "y")),
+    ],
+)
+def test_an_axis_is_supported_where_a_size_is_away_from_zero(parameters: dict[str, Estimate], axes: tuple[str, ...]):
+    claim = claim_of("temperature_bias", "xy")
+    assert supported_axes(Fitted(claim, ("x", "y"), parameters, None)) == axes
+
+
+def test_a_line_of_amplitude_zero_is_no_effect():
+    claim = claim_of("spectral_line", "x", view="line")
+    nothing = {"amplitude": Estimate(0.0, 0.0, 0.0, 0.0, "deg/h"), "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz")}
+    naming = with_supported_claims(naming_with(claim), [[Fitted(claim, ("x",), nothing, None)]])
+    assert not naming.claims
+    assert [(one.axes, one.candidates) for one in naming.unknown] == [(("x",), ("spectral_line",))]
+
+
+def test_an_effect_keeps_the_axes_on_which_its_size_is_known():
+    claim, other = claim_of("temperature_bias", "xy"), claim_of("shupe", "z")
+    numbers = [
+        [Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None) for axis, error in (("x", 0.1), ("y", 1.0))],
+        [Fitted(other, ("z",), {"sensitivity": estimate(0.4, 0.1)}, None)],
+    ]
+    before = naming_with(claim, other)
+    naming = with_supported_claims(before, numbers)
+    assert [(one.effect, one.axes) for one in naming.claims] == [("temperature_bias", ("x",)), ("shupe", ("z",))]
+    assert naming.claims[0].parts == claim.parts[:1]
+    assert [(one.axes, one.generic) for one in naming.unknown] == [(("y",), "~bias(t)")]
+    assert with_supported_claims(before, [numbers[0][:1], numbers[1]]).claims[0].axes == ("x",)
+    assert with_supported_claims(naming, [numbers[0][:1], numbers[1]]) is naming
+
+
+def test_what_chance_does_too_is_not_left_as_unknown():
+    claim = claim_of("temperature_bias", "xy", (30.0, 3.0))
+    numbers = [[Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None) for axis, error in (("x", 0.1), ("y", 1.0))]]
+    naming = with_supported_claims(naming_with(claim), numbers)
+    assert [one.axes for one in naming.claims] == [("x",)]
+    assert not naming.unknown
+
+
+def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
+    """Vibration that does nothing, named by hand: what remains is a mismatch and no effect."""
+    reduced = reduced_of(environment=[SHAKE])
+    baseline = calibrate(reduced)
+    naming = naming_of(reduced, baseline, "vibration_rectification", "mean", ("sensitivity",))
+    naming = replace(naming, null_best=np.arange(8.0))
+    kept, first, fit = conclude.fit_supported(naming, baseline)
+    assert (kept.claims, first, fit.fitted) == ((), [], [])
+    assert effect_tables(fit.fitted, reduced) == []
+    (box,) = unknown_tables(fit.naming, reduced, [])
+    assert box["explained_by"] == []
+    assert "a bias made by vibration" in box["statement"]
+
+
+# --------------------------------------------------------------------------------------------------------------- verdict
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        ({}, "explained"),
+        ({"log_likelihood_gain": -0.1}, "unknown"),
+        ({"log_likelihood_gain": None}, "unknown"),
+        ({"forecast_gain": -0.1}, "partly explained"),
+        ({"forecast_gain": 0.0}, "explained"),
+        ({"forecast_gain": None}, "explained"),
+        ({"coverage95_after": 0.65}, "partly explained"),
+        ({"coverage95_before": 0.99, "coverage95_after": 0.95}, "explained"),
+        ({"coverage95_before": 0.93, "coverage95_after": 0.92}, "explained"),
+        ({"coverage95_before": None, "coverage95_after": None}, "explained"),
+    ],
+)
+def test_held_out_data_decide(change: dict[str, Any], verdict: str):
+    held = GOOD | change
+    assert decide_verdict([{}], ["shupe"], [], held) == verdict
+    assert bool(failed_checks(held)) == (verdict != "explained")
+    assert decide_verdict([{}], ["shupe"], [1], held) != "explained"
+    assert decide_verdict([{}], [], [1], held) == "unknown"
+    assert decide_verdict([], [], [], held) == "no mismatch"
+
+
+NUMBER = st.none() | st.floats(-1e9, 1e9)
+SHARE = st.none() | st.floats(0.0, 1.0)
+
+
+@given(gain=NUMBER, forecast=NUMBER, before=SHARE, after=SHARE, left=st.lists(st.integers(1, 3), max_size=2))
+def test_explained_means_that_the_evidence_is_for_it(gain, forecast, before, after, left):
+    held = GOOD | {"log_likelihood_gain": gain, "forecast_gain": forecast, "coverage95_before": before, "coverage95_after": after}
+    verdict = decide_verdict([{}], ["shupe"], left, held)
+    assert (verdict == "explained") == (not left and not failed_checks(held))
+    if verdict == "explained":
+        assert gain > 0.0
+        assert forecast is None or forecast >= 0.0
+        assert before is None or after is None or after >= min(before, 0.95) - 0.02
+    text = summary(content() | {"verdict": verdict, "unexplained": left, "held_out": held})
+    assert text.endswith(".")
+    assert ("do not describe the record well" in text) == bool(failed_checks(held))
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.0, 1e12), st.floats(1e-9, 1e12), st.floats(1e-300, 1.0)), min_size=1, max_size=6),
+)
+def test_a_limit_over_several_laws_lies_between_theirs(laws):
+    size, sd, share = np.array(laws).T
+    ends = size + 1.6448536269514722 * sd
+    limit = mixture_limit(size, sd, share / share.sum())
+    assert ends.min() * (1.0 - 1e-9) <= limit <= ends.max() * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("points", "told"),
+    [
+        ([[0, 3.0], [400, 6.0], [800, 3.0], [1200, 6.0], [1800, 6.0]], True),
+        ([[0, 0.02], [400, 0.02], [401, 6.0], [800, 6.0], [801, 0.02], [1800, 0.02]], False),
+        ([[0, 0.02], [1500, 0.02], [1501, 6.0], [1800, 6.0]], False),
+    ],
+    ids=["all the time", "over", "at the end"],
+)
+def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: bool):
+    """An event that is over says nothing of later, and the size of one near the end is not known before."""
+    shaken = {"profile": "vibration", "points": points}
+    reduced = reduced_of({"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, axes=("x",), environment=[shaken])
+    baseline = calibrate(reduced)
+    naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
+    held = conclude.worth(reduced, baseline, naming, fit_claims(naming, baseline))
+    assert math.isfinite(held["forecast_gain"]) == told
+    assert held["log_likelihood_gain"] > 0.0
+    if told:
+        assert held["forecast_gain"] > 0.0
+
+
+@pytest.mark.slow
+def test_a_turn_on_the_bench_is_not_explained_by_what_fails_its_forecast(recordings: Callable[[str], Path]):
+    """A real record of 27 s whose rate turns to 123 deg/s at its end; the limits of what was not found once stopped the diagnosis."""
+    path = recordings("fog-hybrid-warmup/run2_turn.txt")
+    known = {"map": {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z"}, "unit": {"gyro": "deg/s", "time": "s"}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = gyrostab.diagnose(gyrostab.regularise(gyrostab.read_log([path], **known)), nulls=100)
+    assert found.verdict == "partly explained"
+    for effect in found.effects:
+        sizes = {name: one for name, one in effect["parameters"].items() if name.split(".")[0] in effects()[effect["name"]].size_parameters}
+        assert not sizes or any(one["low"] > 0.0 or one["high"] < 0.0 for one in sizes.values()), effect
+    failed = failed_checks(found.content["held_out"])
+    assert all(text in str(found) for text in failed)

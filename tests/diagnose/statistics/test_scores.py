@@ -1,0 +1,322 @@
+"""The views: scores that are normal without an effect, and limits where the closed forms put them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.nulls.scores import null_scores, standardise
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import VIEWS, mean, restart
+from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
+from gyrostab.diagnose.statistics import phase_locked as locked
+from gyrostab.diagnose.statistics import power as davar
+from gyrostab.diagnose.statistics import sample_counts as distribution
+from gyrostab.diagnose.statistics import spectral_line as spectrum
+from gyrostab.diagnose.statistics.scores import cube_root_score, exponential_score, over_windows, window_set
+from gyrostab.ingest.make_log import make_log
+from gyrostab.kernels.regression.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
+from gyrostab.noise import LAWS
+from tests.support.reduced_records import BLOCK_S, RATE, baseline, chunks, records
+
+LEVEL = 3600.0 * 0.003**2  # of white noise, (deg/h)^2/Hz
+EVENT = slice(83, 98)  # 15 blocks that no window of 15 has all of
+
+
+@pytest.fixture(scope="module")
+def base() -> xr.Dataset:
+    return baseline()
+
+
+@pytest.fixture(scope="module")
+def null(base):
+    return null_scores(base, chunks(base, 200, np.random.default_rng(11)))
+
+
+def _dense(variance, present, walk, ou, decay):
+    """Covariance of the observations that the kernels stand for, written out."""
+    p = decay.shape[1]
+    since = np.concatenate([[0.0], np.cumsum(walk[:-1])])
+    dense = np.minimum.outer(since, since) + np.diag(variance)
+    for i in range(p):
+        kept = np.concatenate([[0.0], np.cumsum(np.log(decay[:-1, i]))])
+        dense += ou[i] * np.exp(-np.abs(np.subtract.outer(kept, kept)))
+    return dense[np.ix_(present, present)]
+
+
+def test_boxcar_kernels_are_the_dense_algebra():
+    rng = np.random.default_rng(5)
+    n, p = 60, 3
+    variance, walk, ou = rng.uniform(0.5, 2.0, n), rng.uniform(0.0, 0.3, n), rng.uniform(0.1, 1.0, p)
+    decay = np.exp(-rng.uniform(0.5, 1.5, (n, 1)) / np.array([1.0, 5.0, 30.0]))
+    present = rng.random(n) > 0.3
+    innovation, gain, remaining = np.empty(n), np.empty((n, p + 1)), np.empty((n + 1, p + 1, p + 1))
+    filter_gains(variance, present, walk, ou, decay, innovation, gain)
+    remaining_information(innovation, gain, decay, remaining)
+    inverse = np.linalg.inv(_dense(variance, present, walk, ou, decay))
+    series = rng.normal(size=(2, n))
+    out = np.empty_like(series)
+    precision_times(series, innovation, gain, decay, out)
+    np.testing.assert_allclose(out[:, present], series[:, present] @ inverse, rtol=1e-9)
+    assert not out[:, ~present].any()
+    first, stop = np.array([0, 7, 30, 59]), np.array([60, 20, 31, 60])
+    found = np.empty(4)
+    boxcar_information(first, stop, innovation, gain, decay, remaining, found)
+    for box in range(4):
+        x = ((np.arange(n) >= first[box]) & (np.arange(n) < stop[box]))[present].astype(float)
+        assert found[box] == pytest.approx(x @ inverse @ x, rel=1e-9)
+
+
+@given(st.integers(1, 80), st.lists(st.integers(1, 30), min_size=1, max_size=4, unique=True))
+@settings(max_examples=50, deadline=None)
+def test_window_sums_are_sums_over_windows(blocks, lengths):
+    windows = window_set(blocks, lengths)
+    values = np.random.default_rng(blocks).normal(size=(2, blocks, 3))
+    found = over_windows(values, windows)
+    for k, (first, stop) in enumerate(zip(windows.first, windows.stop, strict=True)):
+        assert 0 <= first < stop <= blocks
+        np.testing.assert_allclose(found[:, k], values[:, first:stop].sum(axis=1), atol=1e-12)
+    assert (windows.length == blocks).any()
+
+
+def test_transfer_reproduces_the_laws_of_the_allan_variance():
+    edges = np.geomspace(1e-5, RATE / 2, 4000)
+    middle = np.sqrt(edges[1:] * edges[:-1])
+    tau = np.array([0.01, 0.02, 0.16, 1.28])
+    weights = davar.transfer(edges[:-1], edges[1:], tau, RATE)
+    white = weights @ np.full(middle.size, LEVEL)
+    np.testing.assert_allclose(white, LAWS["N"].avar(tau, 0.003), rtol=2e-4)
+    walk = weights @ (0.02**2 / 3600.0 / (2 * np.pi * middle) ** 2)
+    np.testing.assert_allclose(walk[-1], LAWS["K"].avar(tau[-1], 0.02), rtol=0.02)  # a sampled walk, so long tau only
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3])
+@pytest.mark.parametrize("slow", [{}, {"flicker": 0.01, "walk": 0.1}])
+def test_scores_are_normal_without_an_effect(missing, slow):
+    base = baseline(missing=missing, **slow)
+    found = records(base, 40, np.random.default_rng(3), missing=missing)
+    for name in ("davar", "mean", "cross_axis", "spectrum"):
+        scores = VIEWS[name](found, base)
+        z = scores["z"].values
+        z = z[np.isfinite(z)]
+        assert abs(z.mean()) < 0.05, name
+        assert 0.93 < z.std() < 1.04, name
+        share = np.mean(np.abs(z) > 3.0)
+        assert 0.4 < share / (2 * stats.norm.sf(3.0)) < 2.0, name
+
+
+def _detected(scores, null, name, level=0.01):
+    z = np.nan_to_num(np.abs(standardise(scores, null.views[name])))
+    return float((z.max(axis=(1, 2, 3)) > null.critical(name, level)).mean())
+
+
+def _limits(make, limit, view, name, base, null):
+    """Share of records detected at three quarters and at five quarters of the closed form."""
+    shares = []
+    for factor in (0.75, 1.25):
+        found = records(base, 60, np.random.default_rng(17))
+        make(found, factor * limit)
+        shares.append(_detected(view.score(found, base), null, name))
+    return shares
+
+
+def test_raised_noise_is_seen_from_the_closed_form_on(base, null):
+    def burst(found, epsilon):
+        found["power"][:, 0, EVENT] *= 1.0 + epsilon
+
+    samples = 0.86 * 15 * BLOCK_S * RATE  # the taper leaves this many
+    nats = null.critical("davar", 0.01) ** 2 / 2.0
+    below, above = _limits(burst, 2.0 * np.sqrt(nats / samples), davar, "davar", base, null)
+    assert below < 0.5 < above
+
+
+def test_a_mean_step_is_seen_from_the_closed_form_on(base, null):
+    def step(found, height):
+        found["mean"][:, 0, EVENT] += height
+
+    nats = null.critical("mean", 0.01) ** 2 / 2.0
+    on, record = 15 * BLOCK_S, 180 * BLOCK_S
+    limit = np.sqrt(LEVEL) * np.sqrt(2.0 * nats / (on * (1.0 - on / record)))
+    below, above = _limits(step, limit, mean, "mean", base, null)
+    assert below < 0.5 < above
+
+
+def test_shared_noise_is_seen_from_the_closed_form_on(base, null):
+    def shared(found, rho):
+        power, pairs = found["power"].values, ((0, 1), (0, 2), (1, 2))
+        for place, (a, b) in enumerate(pairs):
+            found["cross"].values[:, place] += rho * np.sqrt(power[:, a] * power[:, b])
+
+    nats = null.critical("cross_axis", 0.01) ** 2 / 2.0
+    limit = np.sqrt(2.0 * nats / (0.86 * 180 * BLOCK_S * RATE) / 3.0)  # three pairs alike
+    below, above = _limits(shared, limit, cross_axis, "cross_axis", base, null)
+    assert below < 0.5 < above
+
+
+def test_a_line_is_seen_from_the_closed_form_on(base, null):
+    def line(found, amplitude):
+        signal, rng = amplitude**2 / 4.0 * 0.926 * BLOCK_S, np.random.default_rng(2)
+        sine = np.sqrt(signal) * np.exp(2j * np.pi * rng.random((60, 8, 23)))
+        noise = np.sqrt(LEVEL / 2.0) * (rng.normal(size=sine.shape) + 1j * rng.normal(size=sine.shape))
+        found["line_power"][:, 1, :, 267] = (np.abs(sine + noise) ** 2).mean(axis=-1)
+
+    limit = 2.0 * np.sqrt(null.critical("spectrum", 0.01) * LEVEL / (0.926 * BLOCK_S * np.sqrt(180)))
+    below, above = _limits(line, limit, spectrum, "spectrum", base, null)
+    assert below < 0.5 < above
+
+
+def test_davar_is_blind_to_a_step_between_its_windows_and_the_mean_is_not(base, null):
+    found = records(base, 40, np.random.default_rng(4))
+    found["mean"][:, 0, 60:120] += 0.06
+    assert _detected(mean.score(found, base), null, "mean") > 0.9
+    scores = davar.score(found, base)
+    scores["z"] = scores["z"].where(scores["stop"] - scores["first"] <= 15)  # the record as a whole sees it at its longest tau
+    assert _detected(scores, null, "davar") < 0.1
+
+
+def test_a_step_raises_the_allan_variance_by_the_closed_form():
+    base = baseline(noise=1e-6)
+    found = records(base, 1, np.random.default_rng(4)).isel(record=0)
+    height, blocks = 0.1, 180
+    found["mean"][0, 90:] += height
+    surface = davar.allan_surface(found, base)
+    whole = surface["windows"].length == blocks
+    for column, tau in enumerate(surface["columns"]["tau_min_s"]):
+        if tau >= 4 * BLOCK_S and surface["columns"]["what"][column] == "avar":
+            # D^2 tau / (3 (W - 2 tau)), its sum over whole blocks
+            expected = height**2 * tau / (3.0 * (blocks * BLOCK_S - 2.0 * tau))
+            assert surface["observed"][0, whole, column] == pytest.approx(expected, rel=0.05)
+
+
+def test_mean_estimates_the_step(base):
+    found = records(base, 1, np.random.default_rng(8)).isel(record=0)
+    found["mean"][2, 60:105] += 0.5
+    scores = mean.score(found, base)
+    best = int(np.nanargmax(scores["z"].values[2, :, 0]))
+    assert (int(scores["first"][best]), int(scores["stop"][best])) == (60, 105) or abs(int(scores["first"][best]) - 60) <= 4
+    inside = (np.arange(180) >= 60) & (np.arange(180) < 105)
+    assert mean.box_mean(found, base, 2, inside) == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_line_has_its_amplitude():
+    from gyrostab.diagnose.reduce.block_statistics import reduce_log
+    from gyrostab.ingest.make_log import make_log
+
+    rng, n = np.random.default_rng(6), 180_000
+    rate = 1.8 * rng.standard_normal((1, n)) + 0.3 * np.sin(2 * np.pi * 13.37 * np.arange(n) / RATE)
+    reduced = reduce_log(make_log(rate, rate=RATE, unit="deg/h"))
+    flat = xr.Dataset(
+        {"spectrum": (("axis", "block", "band"), np.full(reduced["power"].shape, LEVEL))},
+        coords={"axis": reduced["axis"], "frequency": reduced["frequency"]},
+    )
+    scores = spectrum.score(reduced, flat)
+    best = int(np.nanargmax(scores["z"].values[0, -1]))
+    assert float(scores["frequency"][best]) == pytest.approx(13.37, abs=0.06)
+    assert float(scores["estimate"][0, -1, best]) == pytest.approx(0.3, rel=0.1)
+
+
+def test_what_is_locked_to_rotation_and_ramp_is_seen(base):
+    rng = np.random.default_rng(9)
+    found = records(base, 1, rng).isel(record=0)
+    assert locked.score(found, base) is None
+    blocks, samples = 180, BLOCK_S * RATE
+    spread = np.sqrt(2.0 * LEVEL * RATE / samples)
+    order = spread * (rng.normal(size=(40, 3, blocks, 3)) + 1j * rng.normal(size=(40, 3, blocks, 3)))
+    profile = np.sqrt(LEVEL * RATE / 50.0) * rng.normal(size=(40, 3, blocks, 40))
+    found["order"] = (("record", "axis", "block", "harmonic"), order)
+    found["profile"] = (("record", "axis", "block", "phase"), profile)
+    found["profile_samples"] = (("axis", "block", "phase"), np.full((3, blocks, 40), 50))
+    found["channel_rotation_rate"] = ("block", np.full(blocks, 720.0))
+    scores = locked.score(found, base)
+    z = scores["z"].values
+    assert scores["what"].values.tolist() == ["order 1", "order 2", "order 3", "ramp phase"]
+    assert np.allclose(z.std(axis=(0, 1, 2)), 1.0, atol=0.1)
+    assert np.all(z.mean(axis=(0, 1, 2)) < 0.15)
+    found["order"][:, 0, :, 1] += 0.05 * np.exp(0.4j)
+    found["profile"] = found["profile"] + xr.DataArray(0.1 * np.sin(2 * np.pi * np.arange(40) / 40), dims="phase")
+    scores = locked.score(found, base)
+    assert np.median(scores["estimate"].values[:, 0, -1, 1]) == pytest.approx(0.05, rel=0.1)
+    assert np.median(scores["estimate"].values[:, 1, -1, 3]) == pytest.approx(0.1 / np.sqrt(2.0), rel=0.1)
+    assert (scores["z"].values[:, 0, -1, 1] > 5.0).mean() > 0.95
+
+
+def test_transients_and_jumps_after_restarts_are_seen(base):
+    found = records(base, 60, np.random.default_rng(10))
+    assert restart.score(found, base) is None
+    found["restart_begin"] = ("restart", np.array([1000.0, 2400.0]))
+    found["restart_end"] = ("restart", np.array([1010.0, 2410.0]))
+    z = restart.score(found, base)["z"].values
+    assert np.nanstd(z) == pytest.approx(1.0, abs=0.06)
+    since = np.where(np.arange(180) >= 121, np.arange(180) - 121.0, np.where(np.arange(180) >= 51, np.arange(180) - 51.0, np.inf))
+    raised = found.copy()
+    raised["mean"] = found["mean"] + xr.DataArray(0.2 * np.exp(-since / 6.0), dims="block")
+    scores = restart.score(raised, base)
+    assert float(np.nanmean(scores["estimate"].values[..., 1, 1])) == pytest.approx(0.2, rel=0.05)
+    jumped = found.copy()
+    jumped["mean"][:, :, 121:] += 0.1
+    scores = restart.score(jumped, base)
+    jump = scores["estimate"].values[:, :, -1, -1]
+    assert np.mean(jump) == pytest.approx(0.1, rel=0.05)
+    assert int(scores["first"][-1]) == 121
+
+
+def test_counts_and_tails(base):
+    found = records(base, 2, np.random.default_rng(12))
+    found["outliers"][:] = 0
+    found["outliers"][1, 0, 40:43] = 2
+    found["kurtosis"][1, 2, 90:120] += 0.5
+    scores = distribution.score(found, base)
+    of = scores["what"].values.tolist().index
+    z = scores["z"].values
+    short = scores["stop"].values - scores["first"].values == 5
+    best = int(np.argmax(np.where(short, z[1, 0, :, of("outliers")], -1.0)))
+    assert scores["first"].values[best] <= 40
+    assert scores["stop"].values[best] >= 43
+    assert z[1, 2, :, of("kurtosis")].max() > 8.0
+    assert z[0, :, :, of("kurtosis")].max() < 6.0
+
+
+@given(st.floats(4.0, 500.0))
+@settings(max_examples=30, deadline=None)
+def test_cube_root_score_is_the_normal_quantile_of_a_gamma(shape):
+    for p in (0.01, 0.3, 0.7, 0.99):
+        ratio = stats.gamma.ppf(p, shape) / shape
+        assert float(cube_root_score(np.array(ratio), np.array(shape))) == pytest.approx(stats.norm.ppf(p), abs=0.08)
+
+
+@given(st.floats(1e-6, 600.0))
+@settings(max_examples=30, deadline=None)
+def test_exponential_score_is_exact(value):
+    z = float(exponential_score(np.array(value)))
+    assert stats.norm.logsf(z) == pytest.approx(-value, rel=1e-6)
+
+
+def test_a_correlation_score_is_that_of_student():
+    r, n = np.array([0.3, 0.6]), 20.0
+    t = r * np.sqrt((n - 1) / (1 - r**2))
+    np.testing.assert_allclose(cross_axis.correlation_score(r, np.full(2, n)), stats.norm.isf(stats.t.sf(t, n - 1)), rtol=2e-3)
+
+
+def test_one_axis_has_no_pairs():
+    base = baseline(axes="x")
+    found = records(base, 2, np.random.default_rng(1))
+    assert cross_axis.score(found, base) is None
+
+
+@pytest.mark.parametrize("loud", [(6_050, 12_000), (6_050, 6_540)])
+def test_noise_that_is_loud_for_a_while_is_neither_shared_nor_a_line(loud):
+    largest: dict[str, list[float]] = {"cross_axis": [], "spectrum": []}
+    for seed in range(8):
+        noise = np.random.default_rng(seed).standard_normal((2, 12_000))
+        noise[:, slice(*loud)] *= 8.0
+        found = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="100samples")
+        base = calibrate(found, quiet=np.arange(120) < 60)
+        for name, values in largest.items():
+            values.append(float(np.nanmax(np.abs(VIEWS[name](found, base)["z"].values))))
+    assert max(largest["cross_axis"]) < 4.8
+    assert max(largest["spectrum"]) < 4.8

@@ -1,0 +1,260 @@
+"""Noise that swells and sinks, and lines that move: seen from the closed forms on, and nothing else taken for them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.nulls.records import _leaked
+from gyrostab.diagnose.nulls.scores import null_scores, standardise
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result.text import mismatch_statement
+from gyrostab.diagnose.statistics import drifting_line as gliding
+from gyrostab.diagnose.statistics import spectral_line as spectrum
+from gyrostab.diagnose.statistics import variance_stability as restless
+from gyrostab.ingest.make_log import make_log
+from gyrostab.kernels.spectra.periodogram import taper
+from tests.support.reduced_records import baseline, chunks, records
+
+SMALL = {"rate": 10.0, "blocks": 120}
+BLOCKS, LINES = 120, 100
+
+
+@pytest.fixture(scope="module")
+def base() -> xr.Dataset:
+    return baseline(**SMALL)
+
+
+@pytest.fixture(scope="module")
+def null(base):
+    return null_scores(base, chunks(base, 100, np.random.default_rng(31), **SMALL))
+
+
+def _some(base, count, seed):
+    return records(base, count, np.random.default_rng(seed), **SMALL)
+
+
+def _largest(view, found, base, null, row=slice(None)):
+    """Largest standardised score of each record."""
+    name = view.__name__.rsplit(".", 1)[1]
+    z = np.nan_to_num(standardise(view.score(found, base), null.views[name]))
+    return z[:, row].reshape(z.shape[0], -1).max(axis=1)
+
+
+@given(st.integers(4, 30), st.integers(0, 10**6))
+@settings(max_examples=12, deadline=None)
+def test_moments_of_the_scatter_are_those_of_drawn_levels(count, seed):
+    rng = np.random.default_rng(seed)
+    shape = rng.uniform(1.0, 40.0, count)
+    drawn = rng.gamma(shape, size=(40_000, count)) / shape * rng.uniform(0.1, 10.0)
+    mean = (drawn * shape).sum(axis=1, keepdims=True) / shape.sum()
+    scatter = (shape * (drawn - mean) ** 2).sum(axis=1) / mean[:, 0] ** 2
+    wanted, variance = restless.scatter_moments(np.array(float(count)), shape.sum(), (1.0 / shape).sum())
+    assert scatter.mean() == pytest.approx(wanted, abs=5.0 * np.sqrt(variance / scatter.size))
+    error = np.sqrt(((scatter - scatter.mean()) ** 2).var() / scatter.size)
+    assert scatter.var() == pytest.approx(variance, abs=5.0 * error)
+
+
+def test_scores_of_steady_noise_are_normal(base):
+    z = restless.score(_some(base, 60, 3), base)["z"].values
+    z = z[np.isfinite(z)]
+    assert abs(z.mean()) < 0.05
+    assert z.std() == pytest.approx(1.0, abs=0.06)
+    assert 0.4 < (z > 3.0).mean() / 0.00135 < 2.5
+
+
+def test_swelling_noise_is_seen_from_the_closed_form_on(base, null):
+    shape = float(_some(base, 1, 1)["shape"].values[0, 0, 3:].sum())
+    swell = np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 3.7)  # too fast for averages of more than one block
+    critical = null.critical("restless", 0.01)
+    limit = np.sqrt(critical * np.sqrt(2.0 * (BLOCKS - 1)) / (BLOCKS * shape))
+    shares = []
+    for factor in (0.75, 1.3):
+        found = _some(base, 60, 17)
+        found["power"][:, 0] *= np.exp(factor * limit * swell)[:, None]
+        shares.append((_largest(restless, found, base, null, row=0) > critical).mean())
+    assert shares[0] < 0.5 < shares[1]
+
+
+def test_what_swells_on_all_axes_is_seen_sooner_together(base, null):
+    found = _some(base, 30, 5)
+    found["power"] *= np.exp(0.09 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 12.0))[:, None]
+    together, alone = (np.median(_largest(restless, found, base, null, row=row)) for row in (3, slice(0, 3)))
+    assert together > null.critical("restless", 0.01) > alone
+
+
+@given(st.floats(0.01, 100.0))
+@settings(max_examples=5, deadline=None)
+def test_how_loud_steady_noise_is_does_not_matter(factor):
+    base = baseline(**SMALL)
+    found = _some(base, 1, 8)
+    louder = found.copy(deep=True)
+    louder["power"][:, 1] *= factor
+    kept = [restless.score(one, base)["z"].isel(row=[0, 1, 2]).values for one in (found, louder)]
+    np.testing.assert_allclose(*kept, atol=1e-6)
+
+
+def test_a_single_loud_block_is_not_restless(base, null):
+    found = _some(base, 20, 6)
+    found["power"][:, 0, 50] *= 30.0
+    assert (_largest(restless, found, base, null) > null.critical("restless", 0.01)).mean() <= 0.1
+
+
+def test_noise_that_axes_share_is_not_restless(base, null):
+    found = _some(base, 20, 7)
+    found["power"][:, 1] = found["power"][:, 0]
+    found["power"][:, 2] = found["power"][:, 0]
+    found["cross"][:] = found["power"][:, 0].values[:, None]
+    critical = null.critical("restless", 0.01)
+    assert (_largest(restless, found, base, null, row=3) > critical).mean() <= 0.1
+    assert (_largest(restless, found.drop_vars("cross"), base, null, row=3) > critical).mean() > 0.9  # were it not known
+
+
+def test_a_burst_that_has_its_box_is_not_told_again(base, null):
+    found = _some(base, 1, 9).isel(record=0)
+    found["power"][0, 60:75] *= 1.7
+    boxes = locate(found, base, null)
+    assert boxes["what"].values.tolist() == ["level"] or set(boxes["what"].values) == {"avar"}
+    found["power"][1] *= np.exp(0.5 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 9.0))[:, None]
+    boxes = locate(found, base, null)
+    new = boxes.sel(mismatch=[str(what).startswith("restless") for what in boxes["what"].values])
+    assert "y" in {axis for axes in new["axes"].values for axis in str(axes).split()}
+    assert float(new["end"].max() - new["begin"].min()) > 0.9 * BLOCKS * 20.0
+
+
+def test_levelled_powers_have_the_expected_mean(base):
+    found = _some(base, 1, 10).isel(record=0)
+    found["power"][0, 10:40] *= 5.0
+    flat = restless.levelled(found, base, [(["x"], 200.0, 800.0)])
+    ratio = flat["power"].values / base["spectrum"].values
+    np.testing.assert_allclose(ratio[0, 10:40].mean(axis=0), 1.0)
+    np.testing.assert_array_equal(flat["power"].values[1:], found["power"].values[1:])
+    np.testing.assert_array_equal(flat["power"].values[0, 40:], found["power"].values[0, 40:])
+    assert restless.levelled(found, base, []) is found
+
+
+def _moving_line(found, row, first, last, energy, bend=0.0):
+    """Add a line of so much power over the density in each block on its way between two lines, spread over the blocks of each part."""
+    rng = np.random.default_rng(3)
+    level = float(found["line_power"].mean())
+    for part in range(8):
+        for block in range(BLOCKS // 8):
+            t = (part + (block + 0.5) / (BLOCKS // 8)) / 8.0
+            line = round(first + (last - first) * (t + bend * t * (1.0 - t)))
+            beat = 2.0 * np.sqrt(energy) * rng.normal(0.0, np.sqrt(0.5), found.sizes["record"])  # of the line with the noise
+            found["line_power"].values[:, row, part, line] += level * (energy + beat) / (BLOCKS // 8)
+
+
+@pytest.mark.parametrize(("first", "last", "bend"), [(20, 60, 0.0), (75, 30, 0.0), (10, 50, 0.6), (25, 90, -0.6)])
+def test_a_moving_line_is_seen_where_none_of_its_lines_stands_out(base, null, first, last, bend):
+    found = _some(base, 12, 12)
+    energy = 9.0 * np.sqrt(abs(last - first) / (8.0 * BLOCKS))  # nine standard deviations by the closed form
+    _moving_line(found, 1, first, last, energy, bend)
+    critical = null.critical("gliding", 0.01)
+    assert (_largest(gliding, found, base, null) > critical).mean() > 0.5
+    scores = gliding.score(found, base)
+    best = scores["what"].values[np.bincount(standardise(scores, null.views["gliding"])[:, 1, 0].argmax(axis=1)).argmax()]
+    begins, ends = (float(part) for part in str(best).split()[1:])
+    assert begins == pytest.approx(first * 0.05, abs=0.65)
+    assert ends == pytest.approx(last * 0.05, abs=0.65)
+    single = null.critical("spectrum", 0.01)
+    assert (_largest(spectrum, found, base, null) > single).mean() < 0.5
+
+
+def test_a_line_that_stands_and_a_hump_for_a_while_do_not_move(base, null):
+    found = _some(base, 20, 13)
+    found["line_power"][:, 0, :, 37] *= 50.0
+    found["line_power"][:, 1, 3, 20:60] *= 3.0
+    found["line_power"][:, 2, 2:6] *= 4.0
+    assert (_largest(gliding, found, base, null) > null.critical("gliding", 0.01)).mean() <= 0.1
+
+
+def test_steady_noise_has_no_line_that_moves(base, null):
+    assert (_largest(gliding, _some(base, 100, 14), base, null) > null.critical("gliding", 0.01)).mean() <= 0.03
+    assert (_largest(restless, _some(base, 100, 15), base, null) > null.critical("restless", 0.01)).mean() <= 0.03
+
+
+def test_short_records_are_left_alone(base):
+    few = {"rate": 10.0, "blocks": 5}
+    assert restless.score(records(baseline(**few), 2, np.random.default_rng(1), **few), baseline(**few)) is None
+    found = _some(base, 2, 1)
+    assert gliding.score(found.drop_vars("line_power"), base) is None
+    found["line_weight"][:, 4:] = 0.0
+    assert gliding.score(found, base) is None
+
+
+@pytest.mark.parametrize("blocks", [213, 218, 255])
+def test_windows_behind_the_last_average_have_no_score(blocks):
+    small = {"rate": 10.0, "blocks": blocks}
+    found = restless.score(records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small))
+    behind = (found["first"] > blocks // 32 * 32).values
+    assert behind.any()
+    long = np.char.startswith(found["what"].values.astype(str), "restless 640 s")
+    assert long.any()
+    assert np.isnan(found["z"].values[..., behind, :][..., long]).all()
+    whole = (found["stop"] - found["first"] == blocks).values
+    assert np.isfinite(found["z"].values[..., whole, :][..., long]).all()
+
+
+def test_a_part_without_samples_is_stepped_over(base, null):
+    found = _some(base, 12, 16)
+    _moving_line(found, 0, 20, 60, 7.0 * np.sqrt(40.0 / (8.0 * BLOCKS)))
+    found["line_power"][:, :, 4], found["line_weight"][:, 4] = np.nan, 0.0
+    z = gliding.score(found, base)["z"].values
+    assert np.isfinite(z).any()
+    assert np.median(np.nanmax(z, axis=(1, 2, 3))) > 3.0
+
+
+def test_one_axis_has_no_row_of_all():
+    one = baseline(axes="x", **SMALL)
+    found = records(one, 2, np.random.default_rng(1), **SMALL)
+    assert restless.score(found, one)["axes"].values.tolist() == ["x"]
+    assert gliding.score(found, one)["axes"].values.tolist() == ["x"]
+
+
+def test_a_level_and_its_scatter_are_two_mismatches():
+    box = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 100.0, "tau_min_s": 0.01, "tau_max_s": 0.1}
+    box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
+    assert len(merged([box, box | {"what": "restless 20 s"}])) == 2
+    assert len(merged([box | {"what": "restless 40 s"}, box | {"what": "restless 20 s", "axes": "x y"}])) == 1
+
+
+def test_sentences_say_how_fast_and_where_to():
+    box = {"view": "davar", "what": "restless 40 s", "axes": ["x", "y"], "begin": 0.0, "end": 2000.0, "tau_min_s": 0.1, "tau_max_s": 2.9}
+    box |= {"ratio": 4.38, "estimate": 0.08, "sign": 1, "p_value": 1e-4, "frequency": np.nan}
+    told = mismatch_statement(box, 2000.0)
+    assert "axes x and y goes up and down over the whole record" in told
+    assert "one stretch of 40 s to another" in told
+    assert "8 % (rms)" in told
+    glide = box | {"view": "spectrum", "what": "glide 1.58 3.42", "axes": ["y"]}
+    assert "a line that moves over the whole record, from about 1.58 Hz to about 3.42 Hz" in mismatch_statement(glide, 2000.0)
+
+
+def test_drawn_lines_leak_as_those_of_tapered_noise_do():
+    rng, size = np.random.default_rng(2), 200
+    lines = np.abs(np.fft.rfft(rng.normal(size=(40_000, size)) * taper(size), axis=-1)[:, 1:100]) ** 2
+    drawn = _leaked(rng.gamma(12.0, size=(40_000, 99)) / 12.0, size)
+    for wide in (4, 15, 40):  # lines that a way adds up
+        spread = [one[:, 20 : 20 + wide].mean(axis=1).std() / one.mean() for one in (lines, drawn)]
+        alone = [one[:, 20:60].std() / one.mean() for one in (lines, drawn)]
+        seen, wanted = (sums / single * np.sqrt(wide) for sums, single in zip(spread, alone, strict=True))
+        assert wanted == pytest.approx(seen, abs=0.015)
+    assert seen > 1.02
+    assert drawn.min() > 0.0
+    assert drawn.mean() == pytest.approx(1.0, abs=1e-3)
+    assert drawn.var() == pytest.approx(1.0 / 12.0, rel=0.02)
+
+
+def test_a_stretch_that_ends_within_a_block_leaves_nothing_restless():
+    noise = np.random.default_rng(5).standard_normal((2, 60_000))
+    noise[:, 20_000:40_400] *= 6.0
+    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples")
+    base = calibrate(reduced, quiet=np.arange(60) < 20)
+    told = restless.levelled(reduced, base, [(("x", "y"), 2_000.0, 4_100.0)])
+    assert float(np.nanmax(restless.score(told, base)["z"].values)) < 4.8

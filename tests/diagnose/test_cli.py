@@ -1,0 +1,218 @@
+"""The whole way of a diagnosis, the command, and its manners."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import gyrostab
+from gyrostab.diagnose.core import diagnose, quiet_span
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.result.attribution import _can_show, spans
+from gyrostab.diagnose.result.diagnosis import check_diagnosis
+from gyrostab.diagnose.result.tables import chance_of_gain
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.ingest.make_log import make_log
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.report.diagnosis_folder import FILES
+from gyrostab.simulate import simulate
+from tests.support.command_line import call
+
+LOUD = {
+    "log": {"axes": ["x"], "rate": 20.0, "duration": "16min", "start": "2026-03-14T08:00:00", "seed": 5},
+    "noise": {"N": 0.003},
+    "environment": [
+        {"profile": "vibration", "points": [[0, 0.02], [399, 0.02], [400, 6.0], [640, 6.0], [641, 0.02]]},
+        {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": [[0, 28]], "sensor_rate": 0.5},
+        {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 20], [960, 24]], "sensor_rate": 0.2},
+    ],
+    "effect": [{"name": "vibration_noise", "axes": ["x"], "white": 0.0006}],
+}
+
+
+def white(axes: int = 1, *, seconds: float = 600.0, rate: float = 10.0, seed: int = 1) -> xr.Dataset:
+    values = np.random.default_rng(seed).standard_normal((axes, round(seconds * rate)))
+    return make_log(values, rate=rate, unit="deg/h", start="2026-03-14T08:00:00")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """Noise that rises with vibration, a channel that stands still, and one that falls silent for a third of the time."""
+    log = simulate(LOUD).compute()
+    log["temperature"] = log["temperature"].where((np.arange(log.sizes["time_temperature"]) // 20) % 3 != 1)
+    return to_netcdf(log, tmp_path_factory.mktemp("recording") / "log.nc")
+
+
+@pytest.fixture(scope="module")
+def folder(recording, tmp_path_factory) -> Path:
+    found = tmp_path_factory.mktemp("found") / "diagnosis"
+    assert call("diagnose", recording, "-o", found, "--nulls", 100, "--seed", 1, "--quiet-progress") == 0
+    return found
+
+
+def test_the_command_writes_the_four_files(folder: Path):
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    assert [path.name for path in folder.parent.iterdir()] == ["diagnosis"]
+
+
+def test_what_was_put_in_is_named_on_one_axis_beside_a_constant_channel_and_one_with_gaps(folder: Path):
+    content = json.loads((folder / "diagnosis.json").read_text())
+    check_diagnosis(content)
+    assert content["recording"]["axes"] == ["x"]
+    assert set(content["recording"]["channels"]) == {"vibration", "supply_voltage", "temperature"}
+    assert content["verdict"] == "explained", content["mismatches"]
+    (effect,) = content["effects"]
+    assert "vibration_noise" in [effect["name"], *effect["alternatives"]]
+    assert effect["driver"] == "vibration"
+    box = next(box for box in content["mismatches"] if box["view"] == "davar")
+    assert effect["name"] in box["explained_by"]
+    begin, end = (np.datetime64(box[name].removesuffix("Z")) for name in ("start", "end"))
+    assert abs(begin - np.datetime64("2026-03-14T08:06:40")) < np.timedelta64(45, "s")
+    assert abs(end - np.datetime64("2026-03-14T08:10:40")) < np.timedelta64(45, "s")
+    assert content["baseline"]["noise"]["x"]["N"]["value"] == pytest.approx(0.003, rel=0.05)
+    assert content["held_out"]["log_likelihood_gain"] > 10.0
+    assert "supply_bias" in content["not_found"]
+
+
+def test_the_model_simulates_what_was_recorded(folder: Path, recording: Path, tmp_path: Path):
+    again = tmp_path / "again.nc"
+    assert call("simulate", folder / "model.toml", "--like", recording, "-o", again, "--quiet-progress") == 0
+    now, before = gyrostab.open_log(again).rate.values[0], gyrostab.open_log(recording).rate.values[0]
+    loud = slice(8100, 12700)
+    assert now[loud].std() == pytest.approx(before[loud].std(), rel=0.1)
+    assert now[:7900].std() == pytest.approx(before[:7900].std(), rel=0.06)
+
+
+def test_python_opens_what_the_command_wrote(folder: Path):
+    found = gyrostab.open_diagnosis(folder)
+    assert found.effects
+    assert list(found.surfaces["case"].values) == ["recording", "before", "after"]
+    assert set(found.surfaces.data_vars) >= {"avar", "mean", "block_mean", "density", "line_density", "channel_vibration"}
+    assert found.model["noise"].keys() == {"x"}
+    assert tomllib.loads((folder / "model.toml").read_text())["effect"][0]["name"] == found.effects[0]["name"]
+
+
+def test_noise_alone_is_no_mismatch_without_any_channel():
+    told: list[str] = []
+    found = diagnose(white(seconds=600.0, seed=2), nulls=100, block="20s", progress=lambda label, *rest, **more: told.append(label))
+    check_diagnosis(found.content)
+    assert found.verdict == "no mismatch"
+    assert found.effects == []
+    assert found.content["recording"]["channels"] == []
+    assert found.content["not_found"]["shupe"]["upper_limit"] is None
+    assert list(dict.fromkeys(told)) == ["reducing", "calibrating", "comparing", "naming", "fitting"]
+
+
+# ------------------------------------------------------------------------------------------------------------------ manners
+
+
+def test_an_axis_that_never_changes_is_left_out():
+    log = white(2)
+    log["rate"][1] = 3.0
+    with pytest.warns(UserWarning, match="the same on axis y: left out"):
+        found = diagnose(log, nulls=100, seed=1)
+    assert found.verdict == "no mismatch"
+    assert found.content["recording"]["axes"] == list(found.content["baseline"]["noise"]) == ["x"]
+    with pytest.raises(SchemaError, match="the same on axis y: there is no noise"):
+        diagnose(log.isel(axis=[1]), nulls=100)
+
+
+def test_an_existing_folder_is_kept(folder: Path, recording: Path, capfd: pytest.CaptureFixture[str]):
+    before = (folder / "diagnosis.json").read_bytes()
+    capfd.readouterr()
+    assert call("diagnose", recording, "-o", folder) == 2
+    assert "--overwrite" in capfd.readouterr().err
+    assert (folder / "diagnosis.json").read_bytes() == before
+
+
+def test_a_short_recording_is_told_how_long_it_must_be(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    to_netcdf(white(seconds=60.0), tmp_path / "short.nc")
+    assert call("diagnose", tmp_path / "short.nc", "-o", tmp_path / "found") == 2
+    said = capfd.readouterr().err
+    assert "too short to diagnose" in said
+    assert "240 s at least" in said
+    assert not (tmp_path / "found").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda log: white(rate=20.0), "another sampling rate (20 Hz) than the recording (10 Hz)"),
+        (lambda log: log.isel(time=slice(0, 5000)), "another number of samples (5000) than the recording (6000)"),
+        (lambda log: white(axes=2), "another axes (x, y) than the recording (x)"),
+        (lambda log: make_log(log.rate.values, rate=10.0, unit="deg/h", start="2027-01-01"), "another start (2027-01-01"),
+    ],
+)
+def test_a_simulation_on_other_stamps_is_refused_with_what_to_do(change, complaint: str):
+    log = white()
+    with pytest.raises(OptionError) as raised:
+        diagnose(log, simulation=change(log))
+    assert complaint in str(raised.value)
+    assert "--like RECORDING" in str(raised.value)
+
+
+def test_options_that_make_no_sense_are_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    log = white()
+    for options, complaint in (
+        ({"nulls": 20}, "nulls=20"),
+        ({"false_alarm_level": 0.7}, "false_alarm_level=0.7"),
+        ({"seed": -1}, "seed=-1"),
+        ({"block": "1s"}, "needs 16"),
+        ({"quiet": (0.0, 5.0)}, r"quiet holds 0 whole blocks of .* calibration needs 100 samples"),
+        ({"simulation": {"noise": {"x": {"K": 0.0}}}}, "no noise"),
+    ):
+        with pytest.raises(OptionError, match=complaint):
+            diagnose(log, **options)
+    with pytest.raises(SchemaError):
+        diagnose(xr.Dataset())
+    to_netcdf(log, tmp_path / "log.nc")
+    assert call("diagnose", tmp_path / "log.nc", "--quiet", "morning", "-o", tmp_path / "found") == 2
+    assert "START/END" in capfd.readouterr().err
+    assert call("diagnose", tmp_path / "log.nc", "--simulation", tmp_path / "no.toml", "-o", tmp_path / "found") == 2
+    assert "no.toml" in capfd.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["log.nc"]
+
+
+@pytest.mark.parametrize("text", ["", "1h", "0s/", "0s/1h/2h", "dawn/dusk", "2026-13-40/2026-14-50"])
+def test_quiet_stretches_that_cannot_be_read(text: str):
+    with pytest.raises(OptionError, match="quiet"):
+        quiet_span(text)
+
+
+# ------------------------------------------------------------------------------------------------------------------- pieces
+
+
+def test_times_of_an_effect_are_few_or_the_whole_record():
+    begin = np.arange(200.0)
+    there = np.zeros(200, bool)
+    there[50:80] = there[82:90] = True
+    assert spans(there, begin, begin + 1.0) == [(50.0, 90.0)]
+    there[150:170] = True
+    assert spans(there, begin, begin + 1.0) == [(50.0, 90.0), (150.0, 170.0)]
+    assert spans(np.arange(200) % 12 < 3, begin, begin + 1.0) == [(0.0, 200.0)]
+
+
+def test_a_line_explains_a_line_at_its_own_frequency_only():
+    line = Part(Candidate("spectral_line", "line", (), ()), Variant({}, ("amplitude",), np.empty(0)), ("x",), 50.0, place=116)
+    reduced = xr.Dataset(coords={"line_frequency": ("line", np.arange(1, 400) * 0.25)})
+    box = {"view": "spectrum", "what": "line", "frequency": 29.25, "tau_min_s": 0.017, "tau_max_s": 0.017}
+    assert _can_show(line, box, reduced)
+    assert not _can_show(line, box | {"frequency": 12.5}, reduced)
+    assert not _can_show(line, box | {"what": "ramp phase", "frequency": np.nan}, reduced)
+    assert _can_show(line, {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 0.01, "tau_max_s": 0.02}, reduced)
+    assert not _can_show(line, {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0}, reduced)
+    assert not _can_show(line, {"view": "mean", "what": "mean", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0}, reduced)
+
+
+def test_the_chance_of_a_gain_goes_on_beyond_the_null_records():
+    best = np.sort(np.random.default_rng(1).exponential(size=400))
+    chances = [chance_of_gain(best, gain) for gain in np.linspace(0.0, 20.0, 60)]
+    assert np.all(np.diff(chances) <= 1e-12)
+    assert chance_of_gain(best, 7.0) == pytest.approx(np.exp(-7.0), rel=0.9)
+    assert chance_of_gain(best, 0.5) == pytest.approx(np.exp(-0.5), abs=0.06)

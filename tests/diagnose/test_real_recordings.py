@@ -1,0 +1,91 @@
+"""Real recordings in small form: what the diagnosis names on them, and what it must not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gyrostab
+from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.evidence.sample_counts import coarse_lattice
+from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from tests.support.scripts import load_script
+
+pytestmark = pytest.mark.xdist_group("diagnose_recordings")
+SCRIPT = load_script("pipelines/diagnose_recordings.py")
+RESETS_PER_S = 1502 / 360  # counted in the recording by its publisher's notes
+
+
+@pytest.fixture
+def log_of(recordings: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """A recording of the plan, cut to so many seconds; skipped where it is absent."""
+
+    def read(name: str, **cut: float) -> Any:
+        for file in SCRIPT.PLAN["recording"][name]["files"]:
+            monkeypatch.chdir(recordings(file).parents[len(Path(file).parts) - 1])
+        return SCRIPT.log_of(name, **cut)
+
+    return read
+
+
+def names(found: Any) -> list[str]:
+    return [one["name"] for one in found.effects]
+
+
+def test_resets_of_the_ramp_come_before_their_lines(log_of: Callable[..., Any]) -> None:
+    found = gyrostab.diagnose(log_of("fog-blueseis-ramp", end=180.0), nulls=100)
+    first = found.effects[0]
+    assert (first["name"], first["axes"], first["driver"]) == ("feedback_reset", ["z"], "ramp")
+    kicked = first["parameters"]["kick"]["value"] + first["parameters"]["tail"]["value"]
+    assert 25.0 < kicked < 34.0  # 29.5 nrad in the catalogue
+    model = next(one for one in found.model["effect"] if one["name"] == "feedback_reset")
+    assert model["phase"] == "channel"
+    assert model["full"] < 0  # the ramp falls while the rate is positive
+    lines = [box for box in found.content["mismatches"] if "line at 4 Hz" in box["statement"]]
+    assert lines
+    assert all("feedback_reset" in box["explained_by"] for box in lines)
+    assert "spectral_line" not in lines[0]["explained_by"]
+    held = found.content["held_out"]
+    assert held["coverage95_before"] < 0.6
+    assert held["coverage95_after"] > 0.85  # with the resets in the powers
+    assert held["misfit_after"] < 0.2 * held["misfit_before"]
+
+
+def test_the_turns_of_the_ramp_are_counted(log_of: Callable[..., Any]) -> None:
+    turns = reduce_log(log_of("fog-blueseis-ramp", end=60.0))["ramp_turns"].values
+    assert -np.mean(turns) == pytest.approx(RESETS_PER_S, rel=0.01)
+
+
+def test_without_the_ramp_no_resets_are_claimed(log_of: Callable[..., Any]) -> None:
+    found = gyrostab.diagnose(log_of("fog-blueseis-without-ramp", end=180.0), nulls=100)
+    assert found.verdict != "no mismatch"
+    assert "feedback_reset" not in names(found)
+    assert "no channel ramp" in found.content["not_found"]["feedback_reset"]["reason"]
+
+
+def test_a_lattice_as_coarse_as_the_noise_tells_of_no_dead_zone(log_of: Callable[..., Any]) -> None:
+    reduced = reduce_log(log_of("rlg-static-30min"))
+    assert coarse_lattice(reduced).all()
+    level = calibrate(reduced)["coefficient"]
+    found, reasons = effect_candidates(reduced, level)
+    for name in ("dead_zone", "held_samples", "clipping"):
+        assert "lattice" in reasons[name]
+        assert name not in {one.effect for one in found}
+    assert "rate_quantization" in {one.effect for one in found if one.view == "marks"}
+
+
+def test_the_sway_of_the_platform_is_real_motion(log_of: Callable[..., Any]) -> None:
+    found = gyrostab.diagnose(log_of("rlg-static-30min", end=180.0), nulls=100)
+    assert "real_motion" in names(found)
+    assert not {"dead_zone", "held_samples", "clipping"} & set(names(found))
+
+
+def test_the_fibre_optic_axis_is_not_said_to_follow_temperature(log_of: Callable[..., Any]) -> None:
+    found = gyrostab.diagnose(log_of("fog-hybrid-warmup"), nulls=100)
+    thermal = [one for one in found.effects if "temperature" in (one["driver"] or "")]
+    assert not any("z" in one["axes"] for one in thermal)

@@ -1,0 +1,177 @@
+"""The sampling rate from the stamps: drift, bursts, coarse ticks, declared rates, rows missing by a pattern."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from gyrostab.errors import TimeError
+from gyrostab.ingest.grid.place import place_by_stamp
+from gyrostab.ingest.grid.rate import estimate_rate
+from gyrostab.ingest.grid.regularise import gap_table, regularise
+from gyrostab.time.grid import time_coordinate
+from tests.support.raw_rows import START, expected, raw_log, stamps_of
+
+
+@pytest.mark.parametrize("rate", [300.0, 99.3])
+def test_no_drift_over_200_hours(rate):
+    """One row in 64, in stretches over the whole 200 h, written to the microsecond."""
+    last, block = int(200 * 3600 * rate), 1 << 22
+    step = 1e9 / rate
+
+    def stamps():
+        for begin in range(0, last + 1, block * 8):
+            rows = np.arange(begin, min(begin + block // 8, last + 1))
+            yield rows, START + np.rint(rows * (step / 1000)).astype(np.int64) * 1000
+        yield np.array([last]), START + np.rint(np.array([last]) * (step / 1000)).astype(np.int64) * 1000
+
+    estimate = estimate_rate(stamps, where="long.csv")
+    assert estimate.rate == rate
+    placement = place_by_stamp(stamps, rate, tolerance=0.25, max_gap=1e9, where="long.csv")
+    assert placement.size == last + 1
+    assert np.all(placement.runs[:, 0] == placement.runs[:, 1])  # rows are numbered by their true sample
+    exact = START + round(last * Fraction(10**9) / Fraction(repr(rate)))
+    end = time_coordinate(placement.start, rate, placement.size)["time"][-1].values.astype(np.int64)
+    assert abs(int(end) - exact) <= 1
+
+
+def test_bursts_are_placed_by_count_and_a_loss_shows_as_a_lasting_delay():
+    random = np.random.default_rng(4)
+    n, lost = 20_000, 450
+    samples = np.arange(n)
+    samples[12_000:] += lost
+    sent = samples / 100.0
+    packet = np.ceil(sent / 0.07)  # one every 70 ms, unpacked row by row
+    arrival = packet * 0.07 + 0.002 * (np.arange(n) - np.searchsorted(packet, packet)) + random.uniform(0, 0.0005, n)
+    log = regularise(raw_log(START + np.rint(arrival * 1e9).astype(np.int64)))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(100.0, rel=1e-6)
+    assert any("bursts" in note for note in log.attrs["notes"])
+    assert abs(gap_table(log).samples.max() - lost) <= 10
+    assert abs(gap_table(log).samples.sum() - lost) <= 10
+    present = np.flatnonzero(np.isfinite(log.rate.values[0]))
+    assert len(present) == n
+    assert np.abs(present - samples).max() <= 10
+
+
+def test_whole_seconds_shared_by_many_rows_are_not_duplicates():
+    samples = np.arange(60_000)
+    stamps = START + (samples / 99.3 // 1 * 1e9).astype(np.int64)
+    log = regularise(raw_log(stamps))
+    assert log.attrs["sampling_rate_hz"] == 99.3
+    np.testing.assert_array_equal(log.rate.values[0], samples + 1.0)
+    assert abs((log.time.values[0] - np.datetime64(START, "ns")) / np.timedelta64(1, "ms")) < 11
+
+
+def test_declared_rate_without_time():
+    raw = raw_log(None, np.arange(6.0), temperature=[20.0, np.nan, np.nan, np.nan, 21.0, np.nan])
+    raw.attrs |= {"declared_rate_hz": 2.0, "start": "2026-03-11T11:00:00"}
+    log = regularise(raw)
+    assert log.time.values[-1] == np.datetime64("2026-03-11T11:00:02.5")
+    np.testing.assert_array_equal(log.time_temperature.values, np.array(["2026-03-11T11:00:00", "2026-03-11T11:00:02"], "datetime64[ns]"))
+    np.testing.assert_array_equal(log.temperature.values, [20.0, 21.0])
+    with pytest.raises(TimeError, match="--rate"):
+        regularise(raw.assign_attrs(declared_rate_hz=None))
+
+
+def test_wrong_declared_rate_is_an_error_with_both_figures():
+    raw = raw_log(stamps_of(np.arange(500), 100.0))
+    assert regularise(raw, rate=100.0).attrs["sampling_rate_hz"] == 100.0
+    with pytest.raises(TimeError, match=r"tool\.csv: .*200 Hz.*100 Hz.*--rate"):
+        regularise(raw, rate=200.0)
+
+
+def test_a_stretch_at_another_rate_is_told():
+    log = regularise(raw_log(stamps_of(np.r_[0:9000, 9000 + np.arange(4000) * 1.25], 100.0)))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(100.0, rel=1e-4)
+    (note,) = [note for note in log.attrs["notes"] if "split the log" in note]
+    assert "80 Hz" in note
+    assert abs(log.sizes["time"] - 9000 - 3999 * 1.25) < 3
+
+
+def test_three_rows_are_enough():
+    log = regularise(raw_log(stamps_of([0, 1, 5], 10.0)))
+    assert log.attrs["sampling_rate_hz"] == 10.0
+    np.testing.assert_array_equal(log.rate.values[0], [1, 2, np.nan, np.nan, np.nan, 3])
+
+
+def test_arrival_at_random_times_loses_no_row():
+    stamps = START + np.rint(np.sort(np.random.default_rng(0).uniform(0, 100, 10_000)) * 1e9).astype(np.int64)
+    log = regularise(raw_log(stamps))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(100.0, rel=0.02)
+    assert np.isfinite(log.rate.values).sum() == 10_000
+
+
+@pytest.mark.parametrize(("rate", "n"), [(700.0, 2000), (700.0, 50_000), (300.0, 50_000)])
+def test_stamps_coarser_than_the_jitter_of_a_sample(rate, n):
+    """At 700 Hz and whole milliseconds, steps are 1 ms and 2 ms: neither is the period."""
+    keep = np.random.default_rng(1).random(n) > 0.03
+    keep[:50] = True
+    samples = np.flatnonzero(keep)
+    log = regularise(raw_log(START + np.floor(samples * 1e3 / rate).astype(np.int64) * 1_000_000))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-4 if n < 10_000 else 1e-6)
+    assert np.isfinite(log.rate.values).sum() > 0.98 * len(samples)
+    assert abs(log.sizes["time"] - 1 - samples[-1]) <= 1
+
+
+@pytest.mark.parametrize("pattern", [[1, 1, 1, 0, 0], [1, 0, 1, 1, 0], [1, 1, 0], [1, 1, 0, 0, 0, 0, 0]])
+@pytest.mark.parametrize("rate", [100.0, 300.0, 248.7])
+@pytest.mark.parametrize("jitter", [0.0, 0.03])
+def test_rows_missing_in_a_fixed_pattern_leave_the_declared_grid(pattern, rate, jitter):
+    samples = np.flatnonzero(np.resize(pattern, 6000))
+    stamps = stamps_of(samples + np.random.default_rng(3).uniform(-jitter, jitter, len(samples)), rate)
+    log = regularise(raw_log(stamps), rate=rate)
+    assert log.attrs["sampling_rate_hz"] == rate
+    assert np.array_equal(log.rate.values[0], expected(samples), equal_nan=True)
+
+
+@pytest.mark.parametrize("pattern", [[1, 1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0, 1, 1, 0, 0]])
+@pytest.mark.parametrize("rate", [10.0, 248.7])
+@pytest.mark.parametrize("jitter", [0.0, 0.03])
+def test_a_log_whose_steps_recur_has_the_rate_of_the_unit_step_and_names_the_other(pattern, rate, jitter):
+    samples = np.flatnonzero(np.resize(pattern, 6000))
+    samples = samples[(np.arange(samples.size) < 40) | (np.random.default_rng(5).random(samples.size) > 0.002)]  # a few lost beside
+    stamps = stamps_of(samples + np.random.default_rng(3).uniform(-jitter, jitter, len(samples)), rate)
+    log = regularise(raw_log(stamps))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-6)
+    assert np.array_equal(log.rate.values[0], expected(samples), equal_nan=True)
+    (note,) = (note for note in log.attrs["notes"] if "recur" in note)
+    even = float(note.split("give --rate ")[1])
+    assert even == pytest.approx(rate * np.mean(pattern), rel=0.01)
+    log = regularise(raw_log(stamps), rate=even)  # as if rows were read in groups
+    assert log.attrs["sampling_rate_hz"] == even
+    assert np.isfinite(log.rate.values).sum() >= 0.995 * len(samples)
+    assert not any("recur" in note for note in log.attrs["notes"])
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        stamps_of(2 * np.arange(6000) + np.random.default_rng(6).integers(0, 2, 6000), 10.0),  # each on time, or late by 0.1 s
+        START + np.floor(np.arange(6000) * 1e3 / 700.0).astype(np.int64) * 1_000_000,  # 700 Hz, written to the millisecond
+        START + np.floor(np.arange(6000) * 1e3 / 60.0).astype(np.int64) * 1_000_000,
+        stamps_of(np.flatnonzero(np.random.default_rng(7).random(6000) > 0.4), 100.0),  # two of five lost, at random
+        stamps_of(np.flatnonzero(np.resize([1, 1, 0], 6000)) / 1.5, 100.0),  # even for a clock that ticks twice in three samples
+    ],
+)
+def test_even_samples_have_no_steps_that_recur(stamps):
+    assert not any("recur" in note for note in regularise(raw_log(stamps)).attrs["notes"])
+
+
+def test_a_multiple_of_the_rate_is_not_taken_for_it():
+    with pytest.raises(TimeError, match=r"200 Hz.*100 Hz"):
+        regularise(raw_log(stamps_of(np.arange(2000), 100.0)), rate=200.0)
+
+
+@pytest.mark.parametrize("rows", [1000, 5000])
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("group", [4, 5])
+@pytest.mark.parametrize("period_ms", [1, 4, 10])
+def test_even_stamps_and_then_shared_ones(rows: int, share: float, group: int, period_ms: int) -> None:
+    """A logger that falls behind: even stamps at first, then groups of rows that share one. The rate is the same all along."""
+    even = round(rows * (1 - share))
+    shared = even - 1 + group * (1 + np.arange(rows - even) // group)
+    stamps = np.concatenate([np.arange(even), shared]) * period_ms * 1_000_000
+    found = estimate_rate(lambda: iter([(np.arange(rows), stamps)]), where="tool.csv")
+    assert found.rate == pytest.approx(1000 / period_ms, rel=2e-3)

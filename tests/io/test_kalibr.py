@@ -1,0 +1,147 @@
+"""Noise densities for Kalibr: factors worked out by hand, medians of what is observed, limits said to be limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.cli import main
+from gyrostab.errors import OutputError, SchemaError
+from gyrostab.io.datasets import to_netcdf
+from gyrostab.io.kalibr import KEYS, kalibr_noise, to_kalibr
+from gyrostab.schema import OBSERVABLE
+from tests.support import synthetic
+
+# By hand. 1 deg/sqrt(h) = 0.017453292519943 rad / sqrt(3600 s) = 0.017453292519943 / 60 rad/sqrt(s), and rad/sqrt(s) = rad/s/sqrt(Hz).
+# 1 deg/h^1.5 = 0.017453292519943 rad / (3600 s)^1.5 = 0.017453292519943 / 216000; rad/s^1.5 = rad/s^2/sqrt(Hz).
+# 1 deg/h = 0.017453292519943 rad / 3600 s.
+BY_HAND = {
+    "gyroscope_noise_density": 2.908882086657e-4,
+    "gyroscope_random_walk": 8.080228018492e-8,
+    "gyroscope_bias_instability": 4.848136811095e-6,
+}
+
+
+@pytest.fixture
+def product() -> xr.Dataset:
+    """Every window observes N = 2, K = 3 and B = 5 on x, twice that on y."""
+    product = synthetic.product(axes="xy", windows=6)
+    for symbol, value in {"N": 2.0, "K": 3.0, "B": 5.0}.items():
+        product[symbol][:] = np.array([[value], [2 * value]])
+    product["observable"][:] = OBSERVABLE.index("observed")
+    return product
+
+
+def limit_only(product: xr.Dataset, symbol: str, axis: int, upper: float) -> None:
+    product["observable"].loc[{"term": symbol}][axis] = OBSERVABLE.index("upper_limit_only")
+    product[f"{symbol}_upper"][axis] = upper
+    product[symbol][axis] = 1e9  # what the fit says there is no observation
+
+
+def parse(path) -> dict:
+    """Read the two levels of `key: value  # comment` that the file holds."""
+    tree: dict = {}
+    parents = {0: tree}
+    for line in path.read_text().splitlines():
+        text = line.split("#")[0].rstrip()
+        if not text:
+            continue
+        depth = len(text) - len(text.lstrip())
+        key, _, value = (part.strip().strip('"') for part in text.partition(":"))
+        if value:
+            parents[depth][key] = value
+        else:
+            parents[depth][key] = parents[depth + 2] = {}
+    return tree
+
+
+def test_units_are_those_worked_out_by_hand(product):
+    found = kalibr_noise(product)["x"]
+    for key, value in {"gyroscope_noise_density": 2.0, "gyroscope_random_walk": 3.0, "gyroscope_bias_instability": 5.0}.items():
+        assert found[key].value == pytest.approx(value * BY_HAND[key], rel=1e-12)
+    assert KEYS["gyroscope_random_walk"][2] == "rad/s^2/sqrt(Hz)"
+
+
+def test_density_gives_the_scatter_of_the_samples():
+    """White noise of density s has a standard deviation of s sqrt(rate); its Allan deviation at 1 s is s in rad/s."""
+    rate, samples = 100.0, 400_000
+    density = 0.02 * BY_HAND["gyroscope_noise_density"]  # N = 0.02 deg/sqrt(h)
+    rates = np.random.default_rng(3).normal(0.0, density * math.sqrt(rate), samples)  # rad/s
+    means = rates.reshape(-1, int(rate)).mean(axis=1)
+    allan = math.sqrt(np.mean(np.diff(means) ** 2) / 2.0) * 180.0 / math.pi * 3600.0  # deg/h at tau = 1 s
+    assert allan / 60.0 == pytest.approx(0.02, rel=0.05)  # N^2 / tau at tau = 1/3600 h
+
+
+def test_median_over_observed_windows_only(product):
+    product["N"][0] = [1.0, 2.0, 7.0, 1e6, 1e6, np.nan]
+    product["observable"].loc[{"term": "N"}][0, 3:] = OBSERVABLE.index("not_observable")
+    value = kalibr_noise(product)["x"]["gyroscope_noise_density"]
+    assert value.value == pytest.approx(2.0 * BY_HAND["gyroscope_noise_density"])
+    assert (value.meaning, value.share) == ("observed", 0.5)
+
+
+def test_file_has_the_worst_axis_at_the_top_and_every_axis_below(product, tmp_path):
+    text = parse(to_kalibr(product, tmp_path / "imu.yaml"))
+    assert float(text["update_rate"]) == 300.0
+    for key, factor in BY_HAND.items():
+        symbol = KEYS[key][0]
+        assert float(text[key]) == float(text["axes"]["y"][key]) == pytest.approx(float(product[symbol][1, 0]) * factor, rel=1e-6)
+        assert float(text["axes"]["x"][key]) == pytest.approx(float(product[symbol][0, 0]) * factor, rel=1e-6)
+        assert text[f"{key}_meaning"] == "observed"
+
+
+def test_limit_is_said_to_be_one(product, tmp_path):
+    for axis in (0, 1):
+        limit_only(product, "K", axis, upper=8.0 - axis)
+    path = to_kalibr(product, tmp_path / "imu.yaml")
+    text = parse(path)
+    assert text["gyroscope_random_walk_meaning"] == "upper_limit_only"
+    assert float(text["gyroscope_random_walk"]) == pytest.approx(8.0 * BY_HAND["gyroscope_random_walk"], rel=1e-6)
+    assert "95 % UPPER LIMIT" in next(line for line in path.read_text().splitlines() if line.startswith("gyroscope_random_walk:"))
+
+
+def test_worst_axis_may_be_one_with_a_limit_only(product, tmp_path):
+    limit_only(product, "K", 0, upper=50.0)
+    assert parse(to_kalibr(product, tmp_path / "imu.yaml"))["gyroscope_random_walk_meaning"] == "upper_limit_only"
+
+
+def test_what_no_window_shows_is_null(product, tmp_path):
+    product["observable"].loc[{"term": "K"}][:] = OBSERVABLE.index("not_observable")
+    text = parse(to_kalibr(product, tmp_path / "imu.yaml"))
+    assert text["gyroscope_random_walk"] == "null"
+    assert text["gyroscope_random_walk_meaning"] == "not_observable"
+    product["observable"].loc[{"term": "K"}][0] = OBSERVABLE.index("observed")
+    text = parse(to_kalibr(product, tmp_path / "two.yaml"))
+    assert float(text["gyroscope_random_walk"]) == pytest.approx(3.0 * BY_HAND["gyroscope_random_walk"], rel=1e-6)
+
+
+def test_yaml_readers_see_numbers(product, tmp_path):
+    yaml = pytest.importorskip("yaml")
+    product = product.assign_coords(axis=["x", "yes: no"])
+    text = yaml.safe_load(to_kalibr(product, tmp_path / "imu.yaml").read_text())
+    assert all(isinstance(text[key], float) for key in (*BY_HAND, "update_rate"))
+    assert isinstance(text["axes"]["yes: no"]["gyroscope_noise_density"], float)
+
+
+def test_refusals(product, tmp_path):
+    with pytest.raises(SchemaError, match="no variable"):
+        kalibr_noise(synthetic.surface())
+    del product.attrs["sampling_rate_hz"]
+    with pytest.raises(SchemaError, match="sampling_rate_hz"):
+        to_kalibr(product, tmp_path / "imu.yaml")
+    (tmp_path / "there.yaml").touch()
+    with pytest.raises(OutputError, match="overwrite"):
+        to_kalibr(synthetic.product(), tmp_path / "there.yaml")
+
+
+def test_command(tmp_path, capsys):
+    source = str(to_netcdf(synthetic.product(), tmp_path / "product.nc"))
+    assert main(["export", source, "-o", str(tmp_path / "imu.yaml"), "--format", "kalibr"]) == 0
+    assert set(BY_HAND) <= set(parse(tmp_path / "imu.yaml"))
+    assert main(["export", source, "-o", str(tmp_path / "product.zarr"), "--format", "zarr"]) == 0
+    xr.testing.assert_equal(xr.open_zarr(tmp_path / "product.zarr")["N"], xr.open_dataset(source)["N"])
+    assert main(["export", source, "-o", str(tmp_path / "imu.txt"), "--format", "kalibr"]) == 2
+    assert ".yaml" in capsys.readouterr().err

@@ -1,0 +1,129 @@
+"""What the effects of vibration, rotation, lines and motion predict for windows is what they generate, however time is cut."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab.physics.base import Windows
+from gyrostab.physics.registry import make_effect
+from tests.support.effect_bench import random_cuts, run, same_whatever_the_cuts
+
+
+def windows_of(rates, rate, length, drivers, own=None, frequency=None):
+    """Windows side by side, with the mean of the drivers (rms of vibration), and the means of the rates."""
+    n = rates.shape[1] // length
+    edges = np.arange(n + 1) * length / rate
+
+    def mean(values):
+        return np.broadcast_to(np.asarray(values, float), rates.shape[1])[: n * length].reshape(n, length).mean(axis=1)
+
+    reduced = {name: np.sqrt(mean(np.square(values))) if name == "vibration" else mean(values) for name, values in drivers.items()}
+    windows = Windows(
+        begin=edges[:-1],
+        end=edges[1:],
+        frequency=np.geomspace(0.1, rate / 2, 12) if frequency is None else frequency,
+        rate=rate,
+        axes=("x", "y", "z"),
+        drivers=reduced,
+        own={axis: mean(values) for axis, values in (own or {}).items()},
+    )
+    return windows, np.stack([mean(row) for row in rates])
+
+
+T = np.arange(4000) / 10.0
+SPEED = 2.0 + 0.5 * np.floor(T / 40.0) * (-1) ** np.floor(T / 80)
+DRIVERS = {
+    "vibration": 3.0 + 2.0 * np.sin(T / 3.0),
+    "rotation_rate": SPEED,
+    "temperature": 25.0 + np.floor(T / 40.0),
+    **{f"mag_{axis}": 30.0 * np.cos(T / 50.0 + number) for number, axis in enumerate("xyz")},
+    **{f"accel_{axis}": np.cos(T / 50.0 + number) for number, axis in enumerate("xyz")},
+}
+TRUE = {axis: 100.0 * np.cos(T / 60 + number) for number, axis in enumerate("xyz")}
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"name": "vibration_rectification", "sensitivity": 2e-3},
+        {"name": "g_sensitivity", "x": 0.1, "y": -0.2, "z": 0.3},
+        {"name": "magnetic", "x": 0.1, "y": -0.2, "z": 0.3},
+        {"name": "rotation_line", "amplitude": 0.5, "phase": [20, 110, -30], "harmonics": 2},
+        {"name": "scale_factor", "linear": 30, "asymmetry": -10, "cubic": 0.5, "thermal": 2},
+        {"name": "scale_factor", "linear": 3000, "rotation": "true"},
+        {"name": "misalignment", "x": 1, "y": -2, "z": 0.5},
+        {"name": "earth_rate", "latitude": 40, "inclination": 20, "azimuth": 30, "toolface": 60},
+        {"name": "real_motion", "spin": 0.1, "direction": [1.0, -0.5, 0.2]},
+    ],
+    ids=lambda table: table["name"],
+)
+def test_window_means_are_the_design_times_the_parameters(table):
+    effect = make_effect(table)
+    rates = run(effect, size=4000, rate=10.0, drivers=DRIVERS, true=TRUE)
+    windows, means = windows_of(rates, 10.0, 400, DRIVERS, own=TRUE)
+    design = effect.explain(windows).mean
+    each = {name: np.atleast_1d(getattr(effect, name)) for name in design}
+    total = sum(np.broadcast_to(values, means.shape) * each[name].reshape(-1, 1) for name, values in design.items())
+    assert np.abs(means).max() > 1e-3
+    np.testing.assert_allclose(total, means, atol=2e-3 * np.abs(means).max())
+
+
+def test_tilt_leaves_the_slope_of_the_acceleration_in_the_means():
+    effect = make_effect({"name": "real_motion", "x": 0.5, "z": -0.2, "direction": [1.0, -0.5, 0.2]})
+    rates = run(effect, size=4000, rate=10.0, drivers=DRIVERS)
+    windows, means = windows_of(rates, 10.0, 100, DRIVERS)
+    design = effect.explain(windows).mean
+    total = 0.5 * design["x"] - 0.2 * design["z"]
+    np.testing.assert_allclose(total[:, 1:-1], means[:, 1:-1], atol=0.02 * np.abs(means).max())
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"name": "aliased_vibration", "sensitivity": 0.5, "low": 11.0, "high": 13.0},
+        {"name": "aliased_vibration", "sensitivity": 2.0, "low": 11.0, "high": 13.0, "resonance": 9.0, "quality": 6, "sampling": "average"},
+        {"name": "spectral_line", "amplitude": 0.5, "frequency": 3.0, "quality": 4.0},
+        {"name": "spectral_line", "amplitude": 0.5, "frequency": 17.7},
+        {"name": "rotation_line", "amplitude": 0.5, "harmonics": 3},
+        {"name": "real_motion", "sway": 3.0, "frequency": 1.1, "quality": 3.0},
+    ],
+    ids=lambda table: "-".join(map(str, [table["name"], *list(table.values())[2:]])),
+)
+def test_spectra_are_those_that_are_predicted(table):
+    effect = make_effect(table)
+    rate, length, count = 10.0, 1000, 60
+    drivers = {"vibration": 2.0, "rotation_rate": 417.6}
+    rates = run(effect, size=length * count, rate=rate, drivers=drivers, axes=("x", "y", "z"))
+    centres = np.arange(1, 100) * 0.05
+    windows, _ = windows_of(rates, rate, length, drivers, frequency=centres)
+    power = np.abs(np.fft.rfft(rates[0].reshape(count, length) * np.sqrt(8 / 3) * np.hanning(length), axis=1)) ** 2 / (length * rate)
+    f = np.fft.rfftfreq(length, 1 / rate)
+    prediction = effect.explain(windows)
+    (name,) = prediction.spectrum
+    predicted = float(np.atleast_1d(getattr(effect, name))[0]) ** 2 * np.broadcast_to(prediction.spectrum[name], (count, 99)).mean(axis=0)
+    found = power[:, 3:498].mean(axis=0).reshape(99, 5).mean(axis=1)
+    for bands in (9, 11):
+        wide = [values.reshape(-1, bands).sum(axis=1) for values in (predicted, found)]
+        np.testing.assert_allclose(*wide, atol=0.04 * predicted.sum())
+    assert predicted.sum() == pytest.approx(found.sum(), rel=0.06)
+    if prediction.line is not None:
+        place = np.atleast_2d(prediction.line)[0, 0]
+        assert place == pytest.approx(f[power.mean(axis=0).argmax()], abs=0.15)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["bent", "band", "resonance", "lines", "earth", "errors"]))
+@settings(max_examples=24, deadline=None)
+def test_chunks_never_matter(seed, which):
+    table = {
+        "bent": {"name": "real_motion", "sway": 3, "spin": 0.2, "x": 0.1, "z": -0.3, "direction": [1.0, 0.5, -0.5]},
+        "band": {"name": "aliased_vibration", "sensitivity": [1, 2, 3], "resonance": 650, "sampling": "average"},
+        "resonance": {"name": "spectral_line", "amplitude": 1, "frequency": 3.3, "quality": 30},
+        "lines": {"name": "rotation_line", "amplitude": [1, 2, 3], "harmonics": 4, "phase": [1, 2, 3]},
+        "earth": {"name": "earth_rate", "latitude": 30, "inclination": 50, "azimuth": 70},
+        "errors": {"name": "scale_factor", "linear": 30, "asymmetry": -10, "cubic": 0.5, "thermal": 2},
+    }[which]
+    drivers = {name: values[:700] for name, values in DRIVERS.items()}
+    same_whatever_the_cuts(make_effect(table), random_cuts(seed, 700), size=700, drivers=drivers, seed=seed)

@@ -1,0 +1,144 @@
+"""The report stands alone and says the right numbers."""
+
+from __future__ import annotations
+
+import base64
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from gyrostab.errors import OutputError, SchemaError
+from gyrostab.io.datasets import open_log, open_product, to_netcdf
+from gyrostab.report import write_report
+from tests.support import synthetic
+
+
+class _Page(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+        self.images: list[str] = []
+        self.links: list[str] = []
+        self.text = ""
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        self.links += [value for name, value in attrs if name in ("src", "href")]
+        if tag == "img":
+            self.images.append(dict(attrs)["src"])
+            assert dict(attrs)["alt"]
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+
+
+def read(path) -> _Page:
+    page = _Page()
+    page.feed(path.read_text(encoding="utf-8"))
+    assert page.open == []
+    return page
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> _Page:
+    folder = tmp_path_factory.mktemp("report")
+    product = to_netcdf(synthetic.product(), folder / "product.nc")
+    log = to_netcdf(synthetic.log(samples=20_000), folder / "log.nc")
+    return read(write_report(open_product(product), folder / "report.html", log=open_log(log)))
+
+
+def test_the_page_needs_nothing_beside_it(page):
+    assert all(link.startswith("data:image/png;base64,") for link in page.links)
+    assert len(page.images) == 8  # signal, coefficients, two maps, one window for each of three axes, surface
+    for image in page.images:
+        assert base64.b64decode(image.split(",")[1]).startswith(b"\x89PNG")
+
+
+def test_the_coefficient_table_holds_medians_ranges_and_shares(page):
+    product = synthetic.product()
+    rows = [row for row in page.rows if len(row) == 8 and ", " in row[1]]
+    assert len(rows) == 15
+    n_of_y = rows[6]
+    values = product.N.sel(axis="y").values
+    assert n_of_y[1] == "N, angle random walk"
+    assert float(n_of_y[2]) == pytest.approx(np.nanmedian(values), rel=0.01)
+    low, high = (float(text) for text in n_of_y[3].split(" to "))
+    assert (low, high) == pytest.approx(tuple(np.nanquantile(values, [0.05, 0.95])), rel=0.01)
+    assert n_of_y[4:] == ["deg/sqrt(h)", "90 %", "0 %", "–"]
+    q_of_x = rows[0]
+    seen = product.observable.sel(axis="x", term="Q") == 2
+    assert float(q_of_x[2]) == pytest.approx(float(product.Q.sel(axis="x").where(seen).median()), rel=0.01)
+    assert q_of_x[5:7] == ["45 %", "45 %"]
+    r_of_z = rows[14]
+    assert r_of_z[2:4] == ["–", "–"]
+    assert r_of_z[5:7] == ["0 %", "90 %"]
+    assert float(r_of_z[7].removeprefix("< ")) == pytest.approx(synthetic.COEFFICIENTS["R"] * 2 * 1.6, rel=0.01)
+
+
+def test_the_summary_is_in_plain_words(page):
+    text = re.sub(r"\s+", " ", page.text)
+    assert "3 gyro axes (x, y, z) at 300 samples a second from 2 files" in text
+    assert "2026-09-21 14:13:20" in text
+    assert "looked at in 40 windows" in text
+    n = synthetic.product().N.sel(axis="y")
+    said = re.search(r"Axis y:.*?Angle random walk varies from (\S+) to (\S+) deg/sqrt\(h\) and is highest around (\S+ \S+)\.", text)
+    assert said is not None
+    assert [float(said[1]), float(said[2])] == pytest.approx(n.quantile([0.05, 0.95]).values, rel=0.01)
+    assert said[3] == str(n.time[n.argmax("time")].values)[:19].replace("T", " ")
+    assert "urad (observed in 45 % of the windows only)" in text
+    assert "R = " not in text
+    assert "axis x 14 %" in text  # 4 of 40 windows hold nothing, 5 hold 70 %: 1 - 34.5 / 40 = 14 %
+
+
+def test_facts_gaps_and_notes(page):
+    facts = {row[0]: row[1] for row in page.rows if len(row) == 2}
+    assert facts["Files"] == "bore_run_4a.csv, bore_run_4b.csv"
+    assert facts["Window"] == "6 s"
+    assert facts["Step"] == "30 s"
+    assert facts["Treatment of gaps"] == "weighted"
+    (gap,) = [row for row in page.rows if len(row) == 5 and row[4] == "missing"]
+    assert gap[2:4] == ["6.67 s", "2 000"]
+    assert "2 rows could not be read, µ" in page.text
+
+
+def test_words_of_the_user_are_not_markup(tmp_path):
+    product = synthetic.product(windows=6, axes="x")
+    product.attrs["notes"] = ["<script>alert(1)</script> & more"]
+    path = write_report(product, tmp_path / "report.html")
+    assert "<script>" not in path.read_text(encoding="utf-8")
+    page = read(path)
+    assert "<script>alert(1)</script> & more" in page.text
+    assert "Gaps" not in page.text
+    assert len(page.images) == 5
+
+
+def test_one_window_without_any_estimate_still_makes_a_page(tmp_path):
+    page = read(write_report(synthetic.product(axes="x").isel(time=[20]), tmp_path / "report.html"))
+    assert "Axis x: no coefficient is observed in any window." in page.text
+    assert len(page.images) == 4  # no surface of a single window
+
+
+def test_existing_report_and_wrong_input(tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text("old")
+    with pytest.raises(OutputError, match="exists already; give --overwrite"):
+        write_report(synthetic.product(), path)
+    assert path.read_text() == "old"
+    with pytest.raises(SchemaError, match="not a product"):
+        write_report(synthetic.surface(), path, overwrite=True)
+    with pytest.raises(SchemaError):
+        write_report(synthetic.product(), path, log=synthetic.surface(), overwrite=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

@@ -1,0 +1,214 @@
+"""Simulated logs: noise, effects, and the same bits whatever the chunks."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import cloudpickle
+import dask
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gyrostab.allan.davar import davar
+from gyrostab.errors import SchemaError
+from gyrostab.ingest.grid.regularise import gap_table
+from gyrostab.ingest.make_log import make_log
+from gyrostab.io.datasets import open_log, to_netcdf
+from gyrostab.physics.registry import effects
+from gyrostab.schema import check_log
+from gyrostab.simulate import drivers, lazy, read_model, simulate
+from gyrostab.simulate.lazy import Chain
+from tests.support.simulated import BIASED, LOG, WORLD, every_channel, model
+
+# ------------------------------------------------------------------------------------------------------------------- logs
+
+
+def test_it_is_a_log_like_any_other():
+    log = simulate(model())
+    check_log(log)
+    assert dict(log.sizes)["time"] == 1800
+    assert list(log.axis.values) == ["x", "y", "z"]
+    assert log.time.values[0] == np.datetime64("2026-03-14T08:00:00")
+    assert log.rate.chunks is not None
+    assert {"vibration", "temperature", "rotation_rate", "accel_x", "supply_voltage", "light_power"} <= set(log.data_vars)
+    table = gap_table(log)
+    assert table[["seconds", "samples", "cause"]].values.tolist() == [[0.5, 10, "missing"], [5.0, 100, "restart"]]
+    missing = np.isnan(log.rate.values)
+    assert missing.sum() == 3 * 110
+    assert missing[:, 200:210].all()
+    assert missing[:, 800:900].all()
+
+
+def test_it_goes_through_file_and_analysis(tmp_path):
+    log = simulate(model())
+    back = open_log(to_netcdf(log, tmp_path / "log.nc"))
+    np.testing.assert_array_equal(back.rate.values, log.rate.values)
+    assert back.attrs["simulation_seed"] == 0
+    surface = davar(back, window="30s", step="10s")
+    assert np.isfinite(surface.avar.isel(tau=0)).all()
+
+
+def test_noise_reaches_the_analysis_at_its_level():
+    log = simulate({"noise": {"N": 0.02, "z": {"N": 0.04}}}, duration="1h", rate=50.0, seed=1)
+    n = davar(log, window="1h", taus=[0.02]).avar.squeeze(("time", "tau")) ** 0.5 * np.sqrt(0.02 / 3600)
+    np.testing.assert_allclose(n, [0.02, 0.02, 0.04], rtol=0.01)
+
+
+@settings(max_examples=6, deadline=None)
+@given(chunk=st.integers(150, 2500), seed=st.integers(0, 2**32), oversampling=st.sampled_from([1, 3]))
+def test_the_same_seed_gives_the_same_bits_whatever_the_chunks(chunk, seed, oversampling):
+    one = model(log=LOG | {"oversampling": oversampling})
+    np.testing.assert_array_equal(simulate(one, seed=seed, chunk=chunk).rate.values, simulate(one, seed=seed).rate.values)
+
+
+def test_every_effect_gives_the_same_bits_whatever_the_chunks():
+    world = every_channel(90.0)
+    for name, kind in effects().items():
+        plain = read_model(model(environment=[WORLD[5]], effect=[]))
+        one = replace(plain, effects=(kind.example(),))
+        whole, cut = (simulate(one, environment=world, chunk=chunk).rate.values for chunk in (1800, 331))
+        np.testing.assert_array_equal(cut, whole, err_msg=name)
+
+
+def test_another_seed_gives_other_noise():
+    assert np.all(simulate(model(), seed=1).rate.isel(time=5) != simulate(model(), seed=2).rate.isel(time=5))
+
+
+def test_a_slice_is_that_of_the_whole():
+    log = simulate(model(), chunk=200)
+    np.testing.assert_array_equal(log.rate.isel(time=slice(950, 960)).values, log.rate.values[:, 950:960])
+
+
+def test_oversampling_keeps_the_noise_of_the_log():
+    size = {"duration": "30min", "rate": 20.0}
+    for factor in (1, 4):
+        log = simulate({"noise": {"N": 0.02, "K": 3.0}, "log": {"oversampling": factor}}, **size)
+        found = davar(log, window="30min", taus=["0.05s"]).avar.values.mean()
+        assert found == pytest.approx(0.02**2 * 3600 / 0.05 + 9 * 0.05 / 3600 / 3, rel=0.02)
+
+
+# ---------------------------------------------------------------------------------------------------------------- effects
+
+
+def test_an_effect_alone_is_the_difference_of_two_runs():
+    with_effects, without = simulate(model(), seed=5), simulate(model(effect=[]), seed=5)
+    alone = (with_effects.rate - without.rate).values
+    t = np.arange(1800) / 20
+    bias = 0.02 * (np.interp(t, [0, 89], [20, 20 + 89 * 0.5]) - 25.0)
+    present = ~np.isnan(alone[0])
+    np.testing.assert_allclose(alone[0, present], bias[present], rtol=0, atol=1e-9)
+    accel = np.interp(t, np.arange(2250) / 25, with_effects.accel_x.values)
+    np.testing.assert_allclose(alone[1, present], (bias + 0.5 * accel)[present], rtol=0, atol=1e-9)
+
+
+def test_zero_size_changes_nothing_whatever_the_effect():
+    world = every_channel(90.0)
+    plain = read_model(model(environment=[WORLD[5], WORLD[6]], effect=[]))
+    before = simulate(plain, environment=world, seed=3).rate.values
+    for name, kind in effects().items():
+        off = replace(plain, effects=(kind.example().switched_off(),))
+        np.testing.assert_array_equal(simulate(off, environment=world, seed=3).rate.values, before, err_msg=name)
+
+
+def test_each_effect_without_its_channel_says_so():
+    for name, kind in effects().items():
+        needs = kind.example().needs()
+        if not needs:
+            continue
+        bare = replace(read_model({"noise": {"N": 0.01}}), effects=(kind.example(),))
+        with pytest.raises(SchemaError, match=f"effect '{name}' needs the channel '{needs[0]}'.*there are no channels"):
+            simulate(bare, duration="10s", rate=10.0)
+
+
+def test_a_channel_in_the_wrong_unit_is_refused():
+    wrong = [{"profile": "steps", "channel": "temperature", "unit": "V", "points": [[0, 1]]}]
+    with pytest.raises(SchemaError, match="needs 'temperature' in degree_Celsius; the channel is in 'V'"):
+        simulate(model(environment=wrong, effect=BIASED[:1]))
+
+
+def test_units_of_one_quantity_are_converted():
+    """A rate in deg/h drives what wants deg/s."""
+    turning = make_log(np.zeros((3, 100)), rate=10.0, unit="deg/h").assign(
+        spin=("time", np.full(100, 3600.0 * 90.0), {"units": "degree hour-1"})
+    )
+    effect = [{"name": "scale_factor", "linear": 100.0, "driver": ["spin", "temperature"]}]
+    scaled = simulate({"effect": effect}, like=turning)
+    np.testing.assert_allclose(scaled.rate, 90 * 3600 * 1e-4, rtol=1e-9)
+
+
+def test_a_channel_may_have_another_name():
+    world = [{"profile": "steps", "channel": "coil_temperature", "unit": "degC", "points": [[0, 75]]}]
+    effect = [{"name": "temperature_bias", "sensitivity": 0.1, "driver": "coil_temperature"}]
+    hot = simulate({"environment": world, "effect": effect}, duration="5s", rate=10.0)
+    np.testing.assert_allclose(hot.rate.values, 5.0, rtol=1e-12)
+
+
+def test_two_effects_of_one_name_add():
+    world = [{"profile": "steps", "channel": "temperature", "unit": "degC", "points": [[0, 35]]}]
+    log = simulate({"environment": world, "effect": [BIASED[0], BIASED[0]]}, duration="5s", rate=10.0)
+    np.testing.assert_allclose(log.rate.values, 0.4, rtol=1e-12)
+
+
+def test_turning_is_true_rate_on_its_axis():
+    world = [{"profile": "rotation", "points": [[0, 90.0]], "axis": "z"}]
+    log = simulate({"environment": world}, duration="5s", rate=10.0)
+    np.testing.assert_allclose(log.rate.sel(axis="z"), 90.0 * 3600, rtol=1e-12)
+    np.testing.assert_array_equal(log.rate.sel(axis="x"), 0.0)
+
+
+# ----------------------------------------------------------------------------------------------------------------- blocks
+
+
+def test_a_chain_takes_each_step_once_and_goes_back_from_a_state_on_its_way():
+    taken: list[int] = []
+
+    def step(number: int, state: int) -> tuple[int, int]:
+        taken.append(number)
+        return 10 * state, state + number
+
+    chain = Chain(step, 1, 2000)
+    whole = [chain(number) for number in range(2000)]
+    assert taken == list(range(2000))
+    taken.clear()
+    assert chain(1001) == whole[1001]
+    assert len(taken) <= 4  # 2000 steps, 512 states
+    taken.clear()
+    assert [pickle.loads(pickle.dumps(Chain(_count, 1, 50)))(number) for number in (30, 7)] == [10 * (1 + 435), 10 * (1 + 21)]
+
+
+def _count(number: int, state: int) -> tuple[int, int]:
+    return 10 * state, state + number
+
+
+def test_blocks_in_any_order_from_any_thread_are_those_of_the_whole():
+    whole = simulate(model(), seed=2, chunk=100)
+    again = simulate(model(), seed=2, chunk=100)
+    backwards = [again.rate.data.blocks[0, k] for k in reversed(range(18))]
+    parts = dask.compute(*backwards, scheduler="threads", num_workers=4)
+    np.testing.assert_array_equal(np.concatenate(parts[::-1], axis=1), whole.rate.values)
+
+
+def test_a_copy_in_another_process_gives_the_same(monkeypatch):
+    monkeypatch.setattr(drivers, "SHORT", 100)  # channels that are read stretch by stretch travel too
+    log = simulate(model(), seed=2, chunk=300)
+    late = log.rate.data[:, 1500:].compute()
+    copy = cloudpickle.loads(cloudpickle.dumps(log.rate.data))
+    np.testing.assert_array_equal(copy[:, 1500:].compute(), late)
+
+
+def test_writing_in_pieces_makes_each_block_once(tmp_path, monkeypatch):
+    made: list[int] = []
+    step = lazy.next_block
+
+    def counted(plan, state, first, count, units, parts):
+        made.append(first)
+        return step(plan, state, first, count, units, parts)
+
+    monkeypatch.setattr(lazy, "next_block", counted)
+    log = simulate({"noise": {"N": 0.01}}, duration="1h", rate=100.0, chunk=6000)
+    for first in range(0, 360_000, 90_000):
+        log.rate.isel(time=slice(first, first + 90_000)).compute()
+    assert len(made) <= 60 + 3  # threads that come out of turn may make one again

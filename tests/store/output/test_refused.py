@@ -1,0 +1,382 @@
+"""Outputs that would destroy something else: an input, a folder around it, a folder that another program made; and links."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab import davar, fit_noise, make_log, open_log, to_netcdf, to_zarr
+from gyrostab.errors import GyrostabError, OptionError, OutputError
+from gyrostab.jobs.job import folder_of
+from gyrostab.jobs.run import run
+from gyrostab.store.output import check_output, find_foreign_item, new_folder, new_output, protect_inputs
+from tests.support.command_line import WINDOW, call, write_log
+
+QUIET = "--quiet-progress"
+
+
+def read_tree(folder: Path) -> dict[str, object]:
+    """What lies in a folder: content of files, target of links, None for folders."""
+    found: dict[str, object] = {}
+    for path in sorted(folder.rglob("*")):
+        place = path.relative_to(folder).as_posix()
+        found[place] = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
+    return found
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A log as text and as store, a product, a model and a picture of a holiday."""
+    folder = tmp_path_factory.mktemp("made")
+    write_log(folder / "log.csv", 40.0)
+    assert call("ingest", folder / "log.csv", "-o", folder / "log.nc", QUIET) == 0
+    to_zarr(open_log(folder / "log.nc"), folder / "log.zarr")
+    to_netcdf(fit_noise(davar(open_log(folder / "log.nc"), window="20s", step="5s")), folder / "product.nc")
+    (folder / "model.toml").write_text("[noise]\nN = 0.02\n")
+    (folder / "names.toml").write_text('t_probe = "temperature [degC]"\n')
+    (folder / "probe.csv").write_text("time [s],temperature [degC]\n0,20\n20,21\n40,22\n")
+    return folder
+
+
+@pytest.fixture
+def folder(made, tmp_path) -> Path:
+    """The same files, to be spoiled, with a folder of photos called like a store."""
+    import shutil
+
+    shutil.copytree(made, tmp_path / "work")
+    (tmp_path / "work" / "photos.zarr").mkdir()
+    (tmp_path / "work" / "photos.zarr" / "tide.jpg").write_bytes(b"\xff\xd8 the sea")
+    return tmp_path / "work"
+
+
+def refused(folder: Path, *arguments: object, says: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """Call the command line in a folder: it refuses with one message, and changes nothing."""
+    before = read_tree(folder)
+    capfd.readouterr()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert call(*arguments, QUIET) == 2
+    shown = capfd.readouterr().err
+    assert says in shown, shown
+    assert "Traceback" not in shown
+    assert read_tree(folder) == before
+
+
+COMMANDS = {
+    "ingest": ["ingest", "log.csv"],
+    "simulate": ["simulate", "model.toml", "--duration", "5s", "--rate", "10"],
+    "export": ["export", "product.nc", "--format", "zarr"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
+def test_a_folder_that_another_program_made_is_never_replaced(folder, command, overwrite, capfd):
+    refused(folder, *COMMANDS[command], "-o", "photos.zarr", *overwrite, says="holds 'tide.jpg', which gyrostab did not make", capfd=capfd)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_store_that_holds_something_else_is_not_replaced(folder, command, capfd):
+    (folder / "log.zarr" / "rate" / "notes.txt").write_text("mine")
+    refused(folder, *COMMANDS[command], "-o", "log.zarr", "--overwrite", says="holds 'rate/notes.txt'", capfd=capfd)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_store_is_replaced_when_told_so(folder, command, capfd):
+    before = read_tree(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert call(*COMMANDS[command], "-o", "log.zarr", QUIET) == 2
+        assert read_tree(folder) == before
+        assert call(*COMMANDS[command], "-o", "log.zarr", "--overwrite", QUIET) == 0
+    after = read_tree(folder)
+    outside = {name for name in before if not name.startswith("log.zarr/")}
+    assert outside == {name for name in after if not name.startswith("log.zarr/")}
+    assert all(before[name] == after[name] for name in outside)
+    assert before != after
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["ingest", "log.nc", "-o", "log.nc"],
+        ["ingest", "log.zarr", "-o", "log.zarr"],
+        ["ingest", "log.*", "-o", "log.nc"],
+        ["ingest", "log.csv", "--channel", "log.nc", "-o", "log.nc"],
+        ["run", "*.nc", "-o", "product.nc"],
+        ["run", "log.csv", "--channel", "product.nc", "-o", "product.nc", "--resume"],
+        ["davar", "log.csv", "--channel", "log.*", "-o", "log.nc"],
+        ["fit", "product.nc", "-o", "product.nc"],
+        ["correlate", "product.nc", "-o", "product.nc"],
+        ["simulate", "model.toml", "--like", "log.nc", "-o", "log.nc"],
+        ["report", "product.nc", "--log", "log.html", "-o", "log.html"],
+        ["export", "product.nc", "--format", "zarr", "-o", "log.zarr", "--config", "log.zarr/.zattrs"],
+    ],
+    ids=" ".join,
+)
+def test_an_output_that_is_an_input_is_refused(folder, arguments, capfd):
+    (folder / "log.html").hardlink_to(folder / "log.nc")
+    (folder / "log.zarr" / ".zattrs").write_text("")  # an empty TOML file, too
+    refused(folder, *arguments, "--overwrite", says="input", capfd=capfd)
+
+
+@pytest.mark.parametrize("how", [Path.symlink_to, Path.hardlink_to])
+@pytest.mark.parametrize("command", ["ingest", "run"])
+def test_links_do_not_hide_an_input(folder, command, how, capfd):
+    how(folder / "other.nc", folder / "log.nc")
+    refused(folder, command, "log.nc", "-o", "other.nc", "--overwrite", says="is also an input", capfd=capfd)
+    refused(folder, command, "other.nc", "-o", "log.nc", "--overwrite", says="is also an input", capfd=capfd)
+
+
+def test_a_folder_around_an_input_is_refused(folder, capfd):
+    (folder / "logs.zarr").mkdir()
+    write_log(folder / "logs.zarr" / "in.csv", 20.0)
+    refused(folder, "ingest", "logs.zarr/in.csv", "-o", "logs.zarr", "--overwrite", says="a folder around the input", capfd=capfd)
+    (folder / "away.zarr").symlink_to("logs.zarr")
+    refused(folder, "ingest", "logs.zarr/in.csv", "-o", "away.zarr", "--overwrite", says="a folder around the input", capfd=capfd)
+
+
+def test_an_output_inside_a_store_that_is_read_is_refused(folder, capfd):
+    refused(folder, "run", "log.zarr", "-o", "log.zarr/product.nc", *WINDOW, says="lies inside the input", capfd=capfd)
+
+
+# ------------------------------------------------------------------------------------------------------------------- links
+
+
+def test_a_link_to_a_store_stays_a_link_and_its_target_is_replaced(folder):
+    (folder / "latest.zarr").symlink_to("log.zarr")
+    before = read_tree(folder)
+    for _ in range(2):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            assert call("ingest", "log.csv", "-o", "latest.zarr", "--overwrite", QUIET) == 0
+    after = read_tree(folder)
+    assert after.keys() == before.keys()
+    assert after["latest.zarr"] == "log.zarr"
+    assert open_log(folder / "log.zarr").sizes["time"] == 4000
+
+
+def test_a_link_to_a_file_stays_a_link(folder):
+    (folder / "latest.nc").symlink_to(folder / "made.nc")
+    assert call("run", folder / "log.csv", "-o", folder / "latest.nc", *WINDOW, QUIET) == 0
+    assert (folder / "latest.nc").is_symlink()
+    assert not (folder / "made.nc").is_symlink()
+    assert not [name for name in os.listdir(folder) if name.startswith(".")]
+
+
+def test_links_in_a_loop_and_what_is_no_file(folder, capfd):
+    (folder / "a.nc").symlink_to("b.nc")
+    (folder / "b.nc").symlink_to("a.nc")
+    refused(folder, "ingest", "log.csv", "-o", "a.nc", "--overwrite", says="symbolic link in a loop", capfd=capfd)
+    os.mkfifo(folder / "pipe.nc")
+    with pytest.raises(OutputError, match="no regular file"):
+        check_output(folder / "pipe.nc", overwrite=True)
+    with pytest.raises(OutputError, match="no regular file"):
+        check_output("/dev/null", overwrite=True)
+
+
+# ------------------------------------------------------------------------------------------------------- Python functions
+
+
+def test_the_functions_refuse_what_the_commands_refuse(folder):
+    log = open_log(folder / "log.nc")
+    before = read_tree(folder)
+    surface = davar(log, window="20s", step="5s")
+    for dataset in (log, surface, log.isel(time=slice(0, 100))):
+        with pytest.raises(OptionError, match="is also an input"):
+            to_netcdf(dataset, folder / "log.nc", overwrite=True)
+    with pytest.raises(OptionError, match="is also an input"):
+        to_zarr(davar(open_log(folder / "log.zarr"), window="20s", step="5s"), folder / "log.zarr", overwrite=True)
+    with pytest.raises(OutputError, match=r"tide\.jpg"):
+        to_zarr(log, folder / "photos.zarr", overwrite=True)
+    with pytest.raises(OptionError, match="is also an input"):
+        run([folder / "log.nc"], folder / "log.nc", windows={"window": "20s"}, overwrite=True)
+    assert read_tree(folder) == before
+    to_netcdf(log.load(), folder / "log.nc", overwrite=True)
+
+
+def test_a_written_dataset_of_xarray_is_an_input_while_it_is_lazy(tmp_path):
+    made = xr.Dataset({"avar": (("axis", "time", "tau"), np.ones((1, 2, 3)))}, coords={"axis": ["x"]})
+    path = to_netcdf(made, tmp_path / "cube.nc")
+    with xr.open_dataset(path) as lazy, pytest.raises(OptionError, match="is also an input"):
+        to_netcdf(lazy, path, overwrite=True)
+
+
+# ------------------------------------------------------------------------------------------------------- folders of files
+
+
+def test_the_other_files_of_a_folder_of_figures_stay(folder):
+    figures = folder / "figures"
+    figures.mkdir()
+    (figures / "thesis.tex").write_text("years of work")
+    (figures / "davar.png").write_text("mine")
+    before = read_tree(figures)
+    assert call("plot", folder / "product.nc", "-o", figures, QUIET) == 2
+    assert read_tree(figures) == before
+    assert call("plot", folder / "product.nc", "-o", figures, "--overwrite", QUIET) == 0
+    after = read_tree(figures)
+    assert after["thesis.tex"] == before["thesis.tex"]
+    assert after["davar.png"].startswith(b"\x89PNG")
+    assert not any(name.startswith(".") for name in after)
+
+
+def test_figures_that_cannot_be_finished_leave_nothing(folder, monkeypatch):
+    monkeypatch.setattr("gyrostab.plot.figures.save_png", lambda figure, path, dpi: path.write_text("half") and 1 / 0)
+    before = read_tree(folder)
+    for target in ("new/figures", "photos.zarr"):
+        assert call("plot", folder / "product.nc", "-o", folder / target, QUIET) == 1
+    assert read_tree(folder) == before
+
+
+def test_a_folder_of_files_is_checked_before_the_first_is_moved(tmp_path):
+    (tmp_path / "b.txt").mkdir()
+
+    def write() -> None:
+        with new_folder(tmp_path, overwrite=True) as temporary:
+            (temporary / "a.txt").write_text("new")
+            (temporary / "b.txt").write_text("new")
+
+    with pytest.raises(OutputError, match="is a directory"):
+        write()
+    assert [path.name for path in tmp_path.iterdir()] == ["b.txt"]
+
+
+@pytest.mark.parametrize("names", [["notes.txt"], ["report.html"], ["diagnosis.json", "notes.txt"], ["diagnosis.json"]])
+def test_a_diagnosis_replaces_a_diagnosis_only(folder, names, capfd):
+    (folder / "run7").mkdir()
+    for name in names:
+        (folder / "run7" / name).write_text(json.dumps({"schema": "gyrostab.diagnosis/1" if len(names) == 2 else "other"}))
+    refused(folder, "diagnose", "log.nc", "-o", "run7", "--overwrite", says="which gyrostab did not make", capfd=capfd)
+
+
+def test_a_benchmark_replaces_a_benchmark_only(folder, capfd):
+    for name in ("recordings", "truth"):
+        (folder / "proof" / name).mkdir(parents=True)
+    (folder / "proof" / "recordings" / "holiday.wav").write_text("waves")
+    refused(folder, "prove", "-o", "proof", "--overwrite", says="holds 'recordings/holiday.wav'", capfd=capfd)
+    (folder / "proof" / "benchmark.json").write_text('{"schema": "gyrostab.prove/1"}')
+    refused(folder, "prove", "-o", "proof", "--overwrite", says="holds 'recordings/holiday.wav'", capfd=capfd)
+
+
+# ------------------------------------------------------------------------------------------------------ the folder of a run
+
+
+@pytest.mark.parametrize("content", [{"notes.txt": "mine"}, {"job.json": "{}"}, {"lock": "keep"}, {"windows-0000000000.block": ""}, None])
+@pytest.mark.parametrize("option", ["--overwrite", "--resume"])
+def test_a_folder_with_the_name_of_a_job_is_left_alone(folder, content, option, capfd):
+    job = folder_of(folder / "out.nc")
+    if content is None:
+        job.write_text("a file")
+    else:
+        job.mkdir()
+        for name, text in content.items():
+            (job / name).write_text(text)
+    refused(folder, "run", "log.csv", "-o", "out.nc", *WINDOW, option, says="gyrostab did not make what is there", capfd=capfd)
+
+
+# ---------------------------------------------------------------------------------------- the decision and the writing itself
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_stores_of_other_programs_are_known(tmp_path, version):
+    import zarr
+
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=version)
+    group.create_array("one", data=np.zeros((3, 4)), chunks=(1, 4))
+    group.create_group("inner").create_array("two", data=np.ones(5))
+    assert find_foreign_item(tmp_path / "a.zarr") is None
+    (tmp_path / "a.zarr" / "inner" / "link").symlink_to(tmp_path)
+    assert find_foreign_item(tmp_path / "a.zarr") == "inner/link"
+    (tmp_path / "a.zarr" / "inner" / "link").unlink()
+    (tmp_path / "a.zarr" / "inner" / "folder").mkdir()
+    assert find_foreign_item(tmp_path / "a.zarr") is None
+    (tmp_path / "a.zarr" / "inner" / "folder" / "0.0").write_text("")
+    assert find_foreign_item(tmp_path / "a.zarr") == "inner/folder/0.0"
+
+
+@pytest.mark.parametrize("suffix", ["nc", "zarr"])
+def test_what_another_process_has_made_meanwhile_is_not_replaced(tmp_path, suffix):
+    log = make_log(np.zeros((1, 10)), rate=1.0, unit="deg/h")
+    write = to_netcdf if suffix == "nc" else to_zarr
+    target = tmp_path / f"log.{suffix}"
+    options = {"find_foreign": find_foreign_item} if suffix == "zarr" else {}
+    kept: dict[str, object] = {}
+
+    def write_late() -> None:
+        with new_output(target, **options) as temporary:
+            with pytest.warns(UserWarning, match="is being written now"):
+                write(log, target)
+            kept.update(read_tree(tmp_path))
+            (temporary / "x" if suffix == "zarr" else temporary).write_text("late")
+
+    with pytest.raises(OutputError, match="exists already"):
+        write_late()
+    assert {name: value for name, value in kept.items() if ".part" not in name} == read_tree(tmp_path)
+
+
+@pytest.mark.parametrize("renameat2", [True, False])
+def test_a_folder_is_replaced_in_one_step_or_put_back(tmp_path, monkeypatch, renameat2):
+    log = make_log(np.zeros((1, 10)), rate=1.0, unit="deg/h")
+    if not renameat2:
+        monkeypatch.setattr("gyrostab.store.output.write._rename", lambda *_: False)
+    path = to_zarr(log, tmp_path / "log.zarr")
+    to_zarr(log.isel(time=slice(0, 5)), path, overwrite=True)
+    assert open_log(path).sizes["time"] == 5
+    before = read_tree(tmp_path)
+    if not renameat2:
+        rename, done = Path.rename, []
+
+        def fail_once(self, target):
+            done.append(target)
+            if len(done) == 2:
+                raise KeyboardInterrupt
+            return rename(self, target)
+
+        monkeypatch.setattr(Path, "rename", fail_once)
+        with pytest.raises(KeyboardInterrupt):
+            to_zarr(log, path, overwrite=True)
+        assert read_tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("change", ["has changed", "has vanished"])
+def test_an_input_that_changes_before_the_output_is_complete(folder, change, monkeypatch, capfd):
+    from gyrostab.io import datasets as export
+
+    begin = export._begin_netcdf
+
+    def spoil(*arguments):
+        (folder / "log.csv").write_text("other") if change == "has changed" else (folder / "log.csv").unlink()
+        begin(*arguments)
+
+    monkeypatch.setattr(export, "_begin_netcdf", spoil)
+    assert call("ingest", folder / "log.csv", "-o", folder / "new.nc", QUIET) == 2
+    assert change in capfd.readouterr().err
+    assert not [name for name in os.listdir(folder) if "new.nc" in name]
+
+
+def test_a_leftover_of_a_killed_process_is_told(tmp_path):
+    left = tmp_path / ".log.nc.gyrostab-0123abcd.part"
+    left.write_text("half")
+    with pytest.warns(UserWarning, match="killed: then delete it"):
+        to_netcdf(make_log(np.zeros((1, 10)), rate=1.0, unit="deg/h"), tmp_path / "log.nc")
+    assert left.read_text() == "half"
+
+
+def test_long_names_and_names_without_a_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with new_output("n" * 252 + ".nc") as temporary:
+        temporary.write_text("")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with new_folder(".") as inside:
+        (inside / "a.txt").write_text("")
+    assert os.listdir() == ["a.txt"]
+    with pytest.raises(OutputError, match="exists already"):
+        check_output(".", find_foreign=lambda _: None)
+    with protect_inputs(["*.txt"]), pytest.raises(GyrostabError, match="is also an input"):
+        check_output("../here/a.txt", overwrite=True)

@@ -1,0 +1,124 @@
+"""Outputs take their name once they are complete; what fails leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyrostab.errors import OutputError
+from gyrostab.io.datasets import open_surface, to_netcdf, to_zarr
+from gyrostab.store.output import find_foreign_item, new_output
+from tests.support import synthetic
+
+
+@pytest.mark.parametrize("write", [to_netcdf, to_zarr])
+def test_existing_output_is_kept_unless_told_otherwise(tmp_path, write):
+    path = write(synthetic.surface(windows=3), tmp_path / "out")
+    with pytest.raises(OutputError, match="exists already; give --overwrite"):
+        write(synthetic.surface(windows=4), path)
+    assert open_surface(path).sizes["time"] == 3
+    write(synthetic.surface(windows=4), path, overwrite=True)
+    assert open_surface(path).sizes["time"] == 4
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+FULL = """
+import resource, sys
+sys.path.insert(0, {tests!r})
+from tests.support import synthetic
+from gyrostab.errors import OutputError
+from gyrostab.io.datasets import to_netcdf
+log = synthetic.log(samples=300_000)
+log = log.chunk(time=50_000) if {lazy} else log
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+try:
+    to_netcdf(log, "out.nc", overwrite=True)
+except OutputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+def test_a_full_disk_leaves_the_old_file_and_one_message(tmp_path, lazy):
+    (tmp_path / "out.nc").write_text("old")
+    code = FULL.format(tests=str(Path(__file__).parents[3]), lazy=lazy)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+    assert done.stderr == ""
+    assert done.stdout.startswith("out.nc: cannot be written: ")
+    assert "disk full" in done.stdout
+    assert [p.name for p in tmp_path.iterdir()] == ["out.nc"]
+    assert (tmp_path / "out.nc").read_text() == "old"
+
+
+def test_unwritable_directory():
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o555)
+    root = os.geteuid() == 0
+    try:
+        if root:
+            os.seteuid(65534)  # root may write anywhere; nobody may not
+        with pytest.raises(OutputError, match="no permission to write in"), new_output(folder / "out.nc"):
+            pass
+    finally:
+        if root:
+            os.seteuid(0)
+        shutil.rmtree(folder)
+
+
+def test_no_such_directory(tmp_path):
+    with pytest.raises(OutputError, match=r"nowhere/out\.nc': there is no directory"):
+        to_netcdf(synthetic.surface(windows=2), tmp_path / "nowhere" / "out.nc")
+
+
+def test_a_directory_is_not_replaced_by_a_file(tmp_path):
+    (tmp_path / "out.nc").mkdir()
+    with pytest.raises(OutputError, match="is a directory"):
+        to_netcdf(synthetic.surface(windows=2), tmp_path / "out.nc", overwrite=True)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
+def test_an_interruption_leaves_nothing_behind(tmp_path, error):
+    def fail(block):
+        raise error
+
+    surface = synthetic.surface(windows=4).chunk(time=2)
+    surface["avar"] = surface.avar.copy(data=surface.avar.data.map_blocks(fail, dtype=float, meta=np.empty((0, 0, 0))))
+    for write in (to_netcdf, to_zarr):
+        with pytest.raises(error):
+            write(surface, tmp_path / "out")
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_late_piece_of_a_directory_is_removed_too(tmp_path, monkeypatch):
+    """A worker thread may write on for a moment after another one has failed; here it does so between two looks."""
+    late = ["first", "second", "third"]
+
+    def write_on(seconds):
+        if late and len(looks) % 4 == 0:
+            folder.mkdir(exist_ok=True)
+            (folder / late.pop()).touch()
+        looks.append(seconds)
+
+    looks: list[float] = []
+    monkeypatch.setattr("gyrostab.store.output.write.time.sleep", write_on)
+    with pytest.raises(ZeroDivisionError), new_output(tmp_path / "out.zarr", find_foreign=find_foreign_item) as folder:
+        raise ZeroDivisionError
+    assert not late
+    assert not list(tmp_path.iterdir())
+    assert sum(looks[-13:]) > 0.25  # what was not back after so long does not come any more
+
+
+def test_output_has_the_usual_permissions(tmp_path):
+    umask = os.umask(0o022)
+    try:
+        path = to_netcdf(synthetic.surface(windows=2), tmp_path / "out.nc")
+    finally:
+        os.umask(umask)
+    assert path.stat().st_mode & 0o777 == 0o644

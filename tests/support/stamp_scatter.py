@@ -1,0 +1,53 @@
+"""Stamps of known samples with jitter, packets, late rows and losses, for the tests and the benchmark of the regular time axis."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.support.raw_rows import START
+
+JITTER = ("normal", "uniform", "sorted", "latest", "packets", "late")
+LOSSES = ("none", "single", "bursts", "gap")
+UNITS = {"ns": 1, "us": 1000, "ms": 1_000_000}
+PACKET = 7  # rows
+
+
+def lose_samples(kind: str, rows: int, random: np.random.Generator) -> NDArray[np.int64]:
+    """True sample of each of about `rows` rows: all, 1 % lost one by one, 30 % lost in bursts, or one long gap."""
+    if kind == "single":
+        samples = np.flatnonzero(random.random(int(rows * 1.01)) >= 0.01)
+    elif kind == "bursts":
+        kept = np.ones(int(rows / 0.7), dtype=bool)
+        while kept.mean() > 0.7:
+            begin = random.integers(0, len(kept))
+            kept[begin : begin + random.integers(5, 100)] = False
+        samples = np.flatnonzero(kept)
+    else:
+        samples = np.arange(rows)
+        samples[rows // 2 :] += 123_457 * (kind == "gap")
+    return samples - samples[0]
+
+
+def scatter_stamps(samples: NDArray[np.int64], kind: str, scatter: float, random: np.random.Generator) -> NDArray[np.float64]:
+    """Times of arrival [samples]: a standard deviation (half a range if uniform) of `scatter`, in several ways."""
+    noise = random.uniform(-scatter, scatter, len(samples)) if kind == "uniform" else random.normal(0, scatter, len(samples))
+    times = samples + noise
+    if kind == "sorted":
+        return np.sort(times)
+    if kind == "latest":
+        return np.maximum.accumulate(times)
+    if kind == "packets":  # all rows of a packet have the time at which it is complete, and sent
+        packet = samples // PACKET
+        return (packet + 1) * PACKET + np.abs(random.normal(0, scatter, packet[-1] + 1))[packet]
+    if kind == "late":
+        for begin in random.integers(0, len(samples) - 60, max(3, len(samples) // 2000)):
+            end = begin + random.integers(5, 50)
+            if samples[end] - samples[begin] == end - begin:
+                times[begin:end] = np.maximum(times[begin:end], times[end])
+    return times
+
+
+def round_stamps(times: NDArray[np.float64], rate: float, unit: str) -> NDArray[np.int64]:
+    """Stamps [ns] in a unit."""
+    return START + np.rint(times / rate * 1e9 / UNITS[unit]).astype(np.int64) * UNITS[unit]
