@@ -26,12 +26,10 @@ from gyrostab.blindtest.generator.record import signal
 from gyrostab.blindtest.generator.scenario import AXES, draw_world, stream
 from gyrostab.blindtest.generator.shapes import following
 from gyrostab.blindtest.generator.wander import wander_size
-from gyrostab.blindtest.scenarios import commitment as seal
-from gyrostab.blindtest.scenarios import injection as salt
 from gyrostab.blindtest.scenarios.case import make_case
-from gyrostab.blindtest.scenarios.commitment import open_truth, truth_text
+from gyrostab.blindtest.scenarios.commitment import open_truth, seal, truth_text
 from gyrostab.blindtest.scenarios.drivers import sever
-from gyrostab.blindtest.scenarios.injection import counts_of
+from gyrostab.blindtest.scenarios.injection import counts_of, salt
 from gyrostab.blindtest.scenarios.plan import SEVERINGS, plan_case, plan_cases
 from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
 from gyrostab.blindtest.scoring.visibility import FAINT

@@ -14,8 +14,7 @@ from gyrostab.blindtest.generator.detection_limits import NATS, mean_size, share
 from gyrostab.blindtest.generator.measured_noise import _slope, line_density, own_noise
 from gyrostab.blindtest.generator.record import make_log
 from gyrostab.blindtest.generator.scenario import draw_world
-from gyrostab.blindtest.scenarios import injection as salt
-from gyrostab.blindtest.scenarios.injection import rough_noise
+from gyrostab.blindtest.scenarios.injection import rough_noise, salt
 
 RATE, SECONDS = 20.0, 1500.0
 

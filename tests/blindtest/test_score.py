@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from gyrostab.blindtest.generator.catalogue import AMBIGUITY, CATALOGUE, merged
-from gyrostab.blindtest.scoring import curves
-from gyrostab.blindtest.scoring.curves import by_effect, reliability
+from gyrostab.blindtest.scoring.curves import by_effect, curves, reliability
 from gyrostab.blindtest.scoring.injections import salt_differences, salt_table
 from gyrostab.blindtest.scoring.proportions import Target, spread, wilson
 from gyrostab.blindtest.scoring.score import intersection_over_union, score_case

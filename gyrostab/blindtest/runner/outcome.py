@@ -12,8 +12,7 @@ import pandas as pd
 
 from gyrostab.blindtest.runner.figures import draw_completeness, draw_reliability
 from gyrostab.blindtest.runner.folder import TUNING, write_text
-from gyrostab.blindtest.scoring import curves
-from gyrostab.blindtest.scoring.curves import by_effect, reliability
+from gyrostab.blindtest.scoring.curves import by_effect, curves, reliability
 from gyrostab.blindtest.scoring.injections import salt_differences, salt_table
 from gyrostab.blindtest.scoring.score import score_case
 from gyrostab.blindtest.scoring.table import markdown, missed

@@ -17,9 +17,8 @@ __all__ = ["compare_case", "diagnose_case", "draw_case"]
 
 def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | None = None) -> str:
     """Write the recording and the truth of a plan unless both are there; the SHA-256 of the truth. `real` holds what is salted."""
-    from gyrostab.blindtest.scenarios import commitment as seal
     from gyrostab.blindtest.scenarios.case import make_case
-    from gyrostab.blindtest.scenarios.commitment import fingerprint
+    from gyrostab.blindtest.scenarios.commitment import fingerprint, seal
     from gyrostab.blindtest.scenarios.real import make_salted
 
     truth = directory / "truth" / f"{name}.json"
