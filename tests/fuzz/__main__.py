@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 
+from gyrostab.store.output import replace_file
 from tests.fuzz.campaign import BATCH, FORMATS, Tally, ignore_interrupts, load_input, run_batch, server
 from tests.fuzz.table import page, table
 
@@ -122,7 +123,8 @@ def main() -> int:
     for failure in [failure for tally in totals.values() for failure in tally.failures]:
         print(f"{failure['format']}-{failure['name']} {failure['command']}: {failure['code']} {failure['text']}")
     if given.output:
-        given.output.write_text(page(totals, count=given.count, seed=given.seed, jobs=given.jobs, seconds=seconds))
+        with replace_file(given.output) as part:
+            part.write_text(page(totals, count=given.count, seed=given.seed, jobs=given.jobs, seconds=seconds), encoding="utf-8")
     return int(not complete or any(tally.failures for tally in totals.values()))
 
 
