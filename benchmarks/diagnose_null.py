@@ -20,14 +20,14 @@ import xarray as xr
 from page import machine
 from scipy.stats import binom, kstest
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.evidence.held_out import mean_gains, power_gains
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.evidence.held_out import mean_evidence, power_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
-VIEWS = {"means": mean_gains, "powers": power_gains}
+VIEWS = {"means": mean_evidence, "powers": power_evidence}
 
 
 def main() -> None:
@@ -93,7 +93,7 @@ def ranks(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
     found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     for seed, log in logs(rate, lost, range(first, first + options.records)):
         reduced = reduce_log(log)
-        baseline = calibrate(reduced)
+        baseline = calibrate_noise(reduced)
         chunks = list(null_records(reduced, baseline, count=options.nulls, rng=np.random.default_rng(seed), chunk=100))
         nulls = xr.concat(chunks, "record", data_vars="minimal", coords="minimal", compat="override", join="override")
         for view, tried in candidates(reduced).items():

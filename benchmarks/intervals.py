@@ -17,13 +17,13 @@ from page import renew
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import begin_state
 from tests.support.named import COEFFICIENT, record
 
@@ -33,8 +33,8 @@ def frames(reduced, baseline, effect, view, column):
     known, reasons = effect_candidates(reduced, COEFFICIENT)
     one = next(one for one in known if one.effect == effect and one.view == view)
     variant = next(variant for variant in one.variants if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0)
-    claim = Claim(effect, one.driver, ("x",), (Part(one, variant, ("x",), 50.0),), 50.0, 8.0)
-    return Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), begin_state(reduced, baseline), fold_blocks(reduced))
+    claim = Identification(effect, one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0)
+    return Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), begin_state(reduced, baseline), fold_blocks(reduced))
 
 
 def held(reduced, baseline, drawn, effect, view, column, truth, change):
@@ -46,8 +46,8 @@ def held(reduced, baseline, drawn, effect, view, column, truth, change):
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
         )
-        state = explain_away(begin_state(change(one), baseline), list(frame.claims[0].parts))
-        (fitted,) = fit_claims(replace(frame, state=state), baseline)
+        state = condition_on(begin_state(change(one), baseline), list(frame.claims[0].parts))
+        (fitted,) = fit_identifications(replace(frame, state=state), baseline)
         found = fitted.parameters[column]
         inside.append(found.low <= truth <= found.high)
         ratio.append(found.value / truth)
@@ -84,7 +84,7 @@ def main():
     parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
     options = parser.parse_args()
     count, reduced = options.records, record([])
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     drawn = next(iter(null_records(reduced, baseline, count=count, rng=np.random.default_rng(8), chunk=count)))
     lines = [f"| effect | signal | form | inside 95 %, of {count} | bias | scatter |", "| --- | --- | --- | --- | --- | --- |"]
     for effect, view, column, level, form, truth, change in cases(reduced):

@@ -13,13 +13,13 @@ import xarray as xr
 
 from gyrostab.blindtest.scenarios.case import make_case
 from gyrostab.blindtest.scenarios.plan import plan_case
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import gains, totals
+from gyrostab.diagnose.predict.search import compute_evidence, totals
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 
 EFFECTS = ("temperature_bias", "shupe", "warm_up", "vibration_rectification", "bias_jump")
@@ -39,7 +39,7 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
     plan = plan_case(number, seed=777) | {"rate": 10.0, "seconds": 3600, "kind": "single", "names": [name], "strengths": [strength]}
     log, truth = make_case(plan | {"gaps": 0.0, "cuts": 0, "heavy": False, "severing": None})
     reduced = reduce_log(log)
-    baseline, folds = calibrate(reduced), fold_blocks(reduced)
+    baseline, folds = calibrate_noise(reduced), fold_blocks(reduced)
     total = np.zeros(3)
     for axis in truth["effects"][0]["axes"]:
         column, noise = waveform(truth, axis, reduced), {term: np.array([truth["noise"][axis].get(term, 0.0)]) for term in "KB"}
@@ -53,7 +53,7 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
             mean_factors(reduced, baseline, [column], axis=axis, folds=folds)[0, 1, 0],
         ]
     tried = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == name and one.view == "mean"]
-    scored = totals(gains(tried, reduced, begin_state(reduced, baseline), folds))
+    scored = totals(compute_evidence(tried, reduced, begin_state(reduced, baseline), folds))
     return [*total, max(float(gain[0]) for gain in scored.values())]
 
 

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 
 from gyrostab.cli import commands
-from gyrostab.cli.console import complain, explain, plain_notes, read_config, seldom_collected, stoppable
+from gyrostab.cli.console import describe_error, plain_notes, print_error, read_config, relaxed_gc, sigterm_as_interrupt
 from gyrostab.cli.frame import app, find_inputs
 from gyrostab.store.output import protect_inputs
 
@@ -45,18 +45,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.getLogger("asyncio").disabled = not debug  # tasks of zarr that nobody asked after would print tracebacks
     try:
         app.config = read_config(tokens, [command for command in app if not command.startswith("-")])
-        with plain_notes(), stoppable(), seldom_collected():
+        with plain_notes(), sigterm_as_interrupt(), relaxed_gc():
             command, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
             with protect_inputs(find_inputs(bound.arguments)):
                 command(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as stop:
         said = str(stop) or "interrupted; nothing was written under the name of the output. Start the same command again."
-        return complain(said, 3)
+        return print_error(said, 3)
     except BrokenPipeError:  # the reader of our output, for instance `head`, has left
         sys.stderr.close()
         return 0
     except Exception as error:
         if debug:
             raise
-        return explain(error)
+        return describe_error(error)
     return 0

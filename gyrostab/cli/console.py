@@ -18,7 +18,7 @@ from cyclopts import CycloptsError
 from gyrostab.cli.options import read_toml
 from gyrostab.errors import GyrostabError, OptionError
 
-__all__ = ["complain", "explain", "plain_notes", "read_config", "seldom_collected", "stoppable"]
+__all__ = ["describe_error", "plain_notes", "print_error", "read_config", "relaxed_gc", "sigterm_as_interrupt"]
 
 
 def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
@@ -69,7 +69,7 @@ def plain_notes() -> Iterator[None]:
 
 
 @contextmanager
-def stoppable() -> Iterator[None]:
+def sigterm_as_interrupt() -> Iterator[None]:
     """Let a polite ``kill``, a time limit or a closed terminal end the work as Ctrl-C does, with nothing left behind."""
 
     def stop(number: int, frame: Any) -> None:
@@ -89,7 +89,7 @@ def stoppable() -> Iterator[None]:
 
 
 @contextmanager
-def seldom_collected() -> Iterator[None]:
+def relaxed_gc() -> Iterator[None]:
     """Let Python look for unreachable cycles seldom: by its own measure it looks through all that is loaded four times while loading."""
     before = gc.get_threshold()
     gc.set_threshold(10_000, *before[1:])
@@ -99,23 +99,23 @@ def seldom_collected() -> Iterator[None]:
         gc.set_threshold(*before)
 
 
-def complain(text: str, code: int) -> int:
+def print_error(text: str, code: int) -> int:
     """Say what is wrong; the exit code."""
     print(f"gyrostab: {text}", file=sys.stderr)
     return code
 
 
-def explain(error: Exception) -> int:
+def describe_error(error: Exception) -> int:
     """One message for an error, and the exit code."""
     if isinstance(error, CycloptsError):
-        return complain(f"{error} See gyrostab --help, or the command's own --help.", 2)
+        return print_error(f"{error} See gyrostab --help, or the command's own --help.", 2)
     if isinstance(error, GyrostabError):
-        return complain(str(error), 2)
+        return print_error(str(error), 2)
     if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError) and error.filename:
-        return complain(f"{error.filename}: {error.strerror}", 2)
+        return print_error(f"{error.filename}: {error.strerror}", 2)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         where = error.filename or "the standard output"
-        return complain(f"{where}: cannot be written ({error.strerror}); make room, or write elsewhere", 2)
+        return print_error(f"{where}: cannot be written ({error.strerror}); make room, or write elsewhere", 2)
     if isinstance(error, MemoryError):
-        return complain(f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers", 1)
-    return complain(f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.", 1)
+        return print_error(f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers", 1)
+    return print_error(f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.", 1)

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate, from_model, from_simulation
-from gyrostab.diagnose.baseline.known_effects import known_motion, without_known_lines
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model, baseline_from_simulation, calibrate_noise
+from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_lines
 from gyrostab.diagnose.estimate.expected_effects import expected_baseline, without_expected
-from gyrostab.diagnose.estimate.recalibrate import without_hops
+from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.moving_axes import unexplained_motion, without_motion
-from gyrostab.diagnose.locate.mismatches import locate
+from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.attribution import unexpected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
-from gyrostab.diagnose.result.finish import conclude
+from gyrostab.diagnose.result.finish import finish_diagnosis
 from gyrostab.diagnose.task import Compared, Task, still_lines
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.convert import as_log
@@ -34,7 +34,7 @@ from gyrostab.simulate.model import Model, read_model
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import first_stamp
 
-__all__ = ["diagnose", "quiet_span"]
+__all__ = ["diagnose", "parse_quiescent_span"]
 
 _KEPT = 3e8  # bytes of null records that are kept rather than drawn twice
 _AT_ONCE = 6.4e7  # bytes of band powers of the null records that are scored together
@@ -134,7 +134,7 @@ def _diagnose(
     task = Task(log, given, quiet, restart_gap, seed, nulls, level, progress)
     compared = _beside_hops(task, _at_rest(task, _compare(task, *_calibrated(task, reduced))))
     progress("fitting", 0)
-    return conclude(task, compared, begun)
+    return finish_diagnosis(task, compared, begun)
 
 
 def _with_aligned_channels(log: xr.Dataset) -> xr.Dataset:
@@ -147,7 +147,7 @@ def _with_aligned_channels(log: xr.Dataset) -> xr.Dataset:
 
 def _compare(task: Task, reduced: xr.Dataset, baseline: xr.Dataset) -> Compared:
     """Draw null records, name effects, locate what is beyond chance."""
-    seen = without_known_lines(reduced, baseline)
+    seen = remove_known_lines(reduced, baseline)
     records = _records(seen, baseline, task.nulls, task.seed)
     task.progress("comparing", 0)
     null = null_scores(baseline, records())
@@ -157,7 +157,7 @@ def _compare(task: Task, reduced: xr.Dataset, baseline: xr.Dataset) -> Compared:
     naming = name_effects(seen, baseline, records(), level=half, seed=task.seed, known=known, progress=task.progress)
     before = expected_baseline(naming, baseline)
     apart = without_expected(still_lines(task, seen, before) if naming.expected else seen, baseline, naming.expected)
-    found = unexpected(locate(apart, before, null, level=half), naming.expected, seen, before, null, level=half)
+    found = unexpected(locate_mismatches(apart, before, null, level=half), naming.expected, seen, before, null, level=half)
     return Compared(reduced, baseline, found, naming, null)
 
 
@@ -165,7 +165,7 @@ def _calibrated(task: Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset
     """The record and its baseline; the record without the blocks in which a model that was given says that the rate moves."""
     task.progress("calibrating", 0)
     baseline = _baseline(task, reduced)
-    if isinstance(task.given, Model) and (turning := known_motion(reduced, baseline)).any():
+    if isinstance(task.given, Model) and (turning := expect_known_motion(reduced, baseline)).any():
         left = without_motion(task.log, reduced, turning, restart_gap=task.restart_gap, progress=task.progress)
         reduced = left.drop_vars("moving")  # it is accounted for
         baseline = _baseline(task, reduced)
@@ -187,7 +187,7 @@ def _at_rest(task: Task, compared: Compared) -> Compared:
 
 def _beside_hops(task: Task, compared: Compared) -> Compared:
     """The comparison once more with the noise calibrated beside hops within blocks; the same where there are none."""
-    baseline = without_hops(compared.naming, compared.baseline)
+    baseline = remove_fast_switching(compared.naming, compared.baseline)
     return compared if baseline is compared.baseline else _compare(task, compared.reduced, baseline)
 
 
@@ -230,12 +230,12 @@ def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:
 
 def _baseline(task: Task, reduced: xr.Dataset) -> xr.Dataset:
     if task.given is None:
-        return calibrate(reduced, quiet=task.quiet)
+        return calibrate_noise(reduced, quiet=task.quiet)
     if isinstance(task.given, xr.Dataset):
         same = f"{reduced.attrs['block_samples']}samples"
         simulated = reduce_log(task.given, block=same, restart_gap=task.restart_gap, progress=task.progress)
-        return from_simulation(reduced, simulated, quiet=task.quiet)
-    return from_model(reduced, task.given, quiet=task.quiet)
+        return baseline_from_simulation(reduced, simulated, quiet=task.quiet)
+    return baseline_from_model(reduced, task.given, quiet=task.quiet)
 
 
 def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -> Callable[[], Iterable[xr.Dataset]]:
@@ -262,7 +262,7 @@ def _known_apart(baseline: xr.Dataset, given: xr.Dataset | Model | None) -> list
     return [one for one in given.effects if one.name in baseline.attrs["left_out"]] if isinstance(given, Model) else []
 
 
-def quiet_span(text: str) -> tuple[float | str, float | str]:
+def parse_quiescent_span(text: str) -> tuple[float | str, float | str]:
     """Read a quiet stretch as it is given on the command line.
 
     Raises

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.baseline.known_effects import known_motion, without_known_lines
-from gyrostab.diagnose.identify.forward_search import Naming
+from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_lines
+from gyrostab.diagnose.identify.forward_search import Identifications
 from gyrostab.diagnose.identify.moving_axes import without_motion
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.progress import Stage
@@ -58,7 +58,7 @@ class Compared(NamedTuple):
     reduced: xr.Dataset
     baseline: xr.Dataset
     found: xr.Dataset
-    naming: Naming
+    naming: Identifications
     null: NullScores
 
 
@@ -68,8 +68,8 @@ def still_lines(task: Task, reduced: xr.Dataset, known: xr.Dataset) -> xr.Datase
     A step within a block has the spectrum of a step, and a part of the record has only one for all its blocks.
     """
     there = np.isfinite(reduced["power"].transpose("axis", "block", "band").values).any(axis=-1)
-    moving = known_motion(reduced, known)
+    moving = expect_known_motion(reduced, known)
     if not (moving & there).any():
         return reduced
     calm = without_motion(task.log, reduced, moving | ~there, restart_gap=task.restart_gap, progress=task.progress)
-    return without_known_lines(reduced.assign({name: calm[name] for name in ("line_power", "line_weight")}), known)
+    return remove_known_lines(reduced.assign({name: calm[name] for name in ("line_power", "line_weight")}), known)

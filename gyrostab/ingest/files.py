@@ -20,7 +20,7 @@ from gyrostab.errors import FormatError, GyrostabError, OptionError, reading_of
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.combine import attach_channels, concatenate, memory, to_disk
-from gyrostab.ingest.concat import join_logs, log_span
+from gyrostab.ingest.concat import concatenate_logs, log_span
 from gyrostab.ingest.damaged_files import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
 from gyrostab.ingest.formats.binary import has_layout
 from gyrostab.ingest.formats.unread import refuse_unread
@@ -241,7 +241,7 @@ def read_log(
     channels = [_read(path, replace(options, channels_only=True, start=None)) for path in extra]
     spans = lost_spans(lost, _spans(parts), lambda path: scan_file(path, options)) if lost else {}
     if regular:
-        log = join_logs(
+        log = concatenate_logs(
             [_check_regular(part, path.name, options) for path, part in parts.items()],
             regular,
             max_gap=max_gap,

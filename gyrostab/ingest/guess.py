@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gyrostab.ingest.columns.headers import AXIS, TIME, is_time_unit, is_unit_of
-from gyrostab.ingest.inspect import ColumnLook, FileLook
+from gyrostab.ingest.inspect import ColumnLook, FileInspection
 from gyrostab.units import parse_unit
 
 __all__ = ["Guess", "guess_columns", "rate_plausibility", "temperature_unit"]
@@ -72,7 +72,7 @@ class Guess:
     sampling_rate_hz: float = math.nan
 
 
-def guess_columns(look: FileLook, *, rate: float | None = None, rate_hint: float | None = None, angles: bool = False) -> Guess:
+def guess_columns(look: FileInspection, *, rate: float | None = None, rate_hint: float | None = None, angles: bool = False) -> Guess:
     """Guess what the columns of a file are.
 
     Parameters
@@ -118,7 +118,7 @@ def _seconds(unit: str | None) -> float:
 # --- the time ----------------------------------------------------------------------------------------------------
 
 
-def _guess_time(look: FileLook, reasons: list[str]) -> tuple[ColumnLook | None, str | None]:
+def _guess_time(look: FileInspection, reasons: list[str]) -> tuple[ColumnLook | None, str | None]:
     best: tuple[float, ColumnLook, str, str] | None = None
     for column in look.columns:
         if (
@@ -168,7 +168,7 @@ def _rate_distance(column: ColumnLook, unit: str) -> float:
 # --- the axes ----------------------------------------------------------------------------------------------------
 
 
-def _guess_axes(look: FileLook, time: ColumnLook | None, reasons: list[str]) -> dict[str, ColumnLook]:
+def _guess_axes(look: FileInspection, time: ColumnLook | None, reasons: list[str]) -> dict[str, ColumnLook]:
     known = {column.name.lower(): column for column in look.columns if column.role == "gyro"}
     if known:
         return {AXIS.sub(r"\2", name): column for name, column in known.items()}
@@ -229,7 +229,7 @@ def _groups(columns: Sequence[ColumnLook]) -> Iterator[tuple[str, dict[str, Colu
             yield f"{column.key[:place]}*{column.key[place + 1 :]}", {letter[0].lower() if letter else "x": column}
 
 
-def _score(template: str, group: Sequence[ColumnLook], look: FileLook) -> float:
+def _score(template: str, group: Sequence[ColumnLook], look: FileInspection) -> float:
     """How much a group of columns looks like a gyro."""
     low = template.lower()
     if any(_given_unit(column) for column in group):
@@ -291,7 +291,9 @@ def temperature_unit(column: ColumnLook) -> str:
     return str(column.unit if given else _name_unit(column, "temperature") or "degC")
 
 
-def _guess_unit(look: FileLook, axes: dict[str, ColumnLook], rate: float, reasons: list[str], warnings: list[str], *, angles: bool) -> str:
+def _guess_unit(
+    look: FileInspection, axes: dict[str, ColumnLook], rate: float, reasons: list[str], warnings: list[str], *, angles: bool
+) -> str:
     group = list(axes.values())
     for column in group:
         named = _name_unit(column, "rate")

@@ -16,7 +16,7 @@ from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.files import _read, scan_file
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 
-__all__ = ["ColumnLook", "FileLook", "look_into"]
+__all__ = ["ColumnLook", "FileInspection", "inspect_file"]
 
 #: Columns that are looked into; a log of sensors has tens of them.
 MOST_COLUMNS = 100
@@ -62,7 +62,7 @@ class ColumnLook:
 
 
 @dataclass(frozen=True)
-class FileLook:
+class FileInspection:
     """What a file holds: its summary, the columns, the rows, and the column of the time where that is known."""
 
     summary: FileSummary
@@ -73,7 +73,7 @@ class FileLook:
     notes: tuple[str, ...] = ()
 
 
-def look_into(path: str | Path, options: ReadOptions | None = None) -> FileLook:
+def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileInspection:
     r"""Look into every column of a file, in any format that gyrostab reads.
 
     Parameters
@@ -122,7 +122,7 @@ def look_into(path: str | Path, options: ReadOptions | None = None) -> FileLook:
         raise FormatError(f"{path.name}: there is no number in any of its columns; is it a log?")
     notes = [f"{len(others) - MOST_COLUMNS} further columns are not looked into"] if len(others) > MOST_COLUMNS else []
     rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
-    return FileLook(summary, tuple(columns), rows, time, _row_rate(log, "row"), tuple(notes))
+    return FileInspection(summary, tuple(columns), rows, time, _row_rate(log, "row"), tuple(notes))
 
 
 def _row_rate(log: xr.Dataset, dim: str) -> float:

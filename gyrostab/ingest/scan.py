@@ -19,7 +19,7 @@ from gyrostab.errors import GyrostabError
 
 if TYPE_CHECKING:
     from gyrostab.ingest.guess import Guess
-    from gyrostab.ingest.inspect import FileLook
+    from gyrostab.ingest.inspect import FileInspection
 
 __all__ = ["COLUMNS", "Examined", "Look", "examine", "next_command", "print_look", "print_next", "print_scan", "scan"]
 
@@ -74,7 +74,7 @@ class Look:
     """What was found in a file that cannot be read as it is: its columns, the guess, and the options that read it."""
 
     paths: list[Path]  # with the same columns; the first was looked into
-    look: FileLook
+    look: FileInspection
     guess: Guess
     options: dict[str, Any]
     row: dict[str, Any] | None  # of the table, read with these options
@@ -127,14 +127,14 @@ def _look(path: Path, reading: dict[str, Any], looks: dict[Any, Look | None]) ->
     """Look into a file, unless one with the same columns was looked into."""
     from gyrostab.ingest import ReadOptions, scan_file
     from gyrostab.ingest.guess import guess_columns
-    from gyrostab.ingest.inspect import look_into
+    from gyrostab.ingest.inspect import inspect_file
 
     options = ReadOptions(**{name: value for name, value in reading.items() if name not in ("max_gap", "on_file")})
     try:
         headers = tuple((column.header, column.role, column.unit) for column in scan_file(path, options).columns)
         if headers not in looks:
             looks[headers] = None
-            inside = look_into(path, options)
+            inside = inspect_file(path, options)
             angles = options.kind == "angle"
             guess = guess_columns(inside, rate=options.rate, rate_hint=_named_rate(path), angles=angles)
             looks[headers] = _try_guess(path, inside, guess, reading)
@@ -146,7 +146,7 @@ def _look(path: Path, reading: dict[str, Any], looks: dict[Any, Look | None]) ->
     return found
 
 
-def _try_guess(path: Path, look: FileLook, guess: Guess, reading: dict[str, Any]) -> Look:
+def _try_guess(path: Path, look: FileInspection, guess: Guess, reading: dict[str, Any]) -> Look:
     """Read the file by the guess, and with the sampling rate if the stamps alone do not tell it."""
     from gyrostab.ingest.guess import temperature_unit
 

@@ -27,9 +27,9 @@ from gyrostab.blindtest.generator.scenario import AXES, draw_world, stream
 from gyrostab.blindtest.generator.shapes import following
 from gyrostab.blindtest.generator.wander import wander_size
 from gyrostab.blindtest.scenarios.case import make_case
-from gyrostab.blindtest.scenarios.commitment import open_truth, seal, truth_text
+from gyrostab.blindtest.scenarios.commitment import commit_case, open_truth, truth_text
 from gyrostab.blindtest.scenarios.drivers import sever
-from gyrostab.blindtest.scenarios.injection import counts_of, salt
+from gyrostab.blindtest.scenarios.injection import counts_of, inject_effect
 from gyrostab.blindtest.scenarios.plan import SEVERINGS, plan_case, plan_cases
 from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
 from gyrostab.blindtest.scoring.visibility import FAINT
@@ -278,7 +278,7 @@ def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
     attributes, dimensions = set(), set()
     for plan in plans:
         log, truth = make_case(plan)
-        digest = seal(log, truth, tmp_path, name=f"{plan['index']:04d}")
+        digest = commit_case(log, truth, tmp_path, name=f"{plan['index']:04d}")
         assert open_truth(tmp_path / "truth" / f"{plan['index']:04d}.json", sha256=digest)["plan"]["names"] == plan["names"]
         attributes.add(tuple(sorted(log.attrs)))
         dimensions |= set(map(str, log.variables))
@@ -301,7 +301,7 @@ def test_channels_of_nulls_are_those_of_effects():
 
 def test_a_sealed_recording_is_read_as_a_log(tmp_path):
     log, truth = make_case(small("vibration_rectification"))
-    digest = seal(log, truth, tmp_path, name="a")
+    digest = commit_case(log, truth, tmp_path, name="a")
     again = gyrostab.regularise(gyrostab.read_log(tmp_path / "recordings" / "a.nc"))
     np.testing.assert_array_equal(again.rate.values, log.rate.values)
     np.testing.assert_array_equal(again.time.values, log.time.values)
@@ -378,7 +378,7 @@ def test_naive_detectors_see_what_is_loud_and_little_else():
 
 def test_salt_on_a_log_adds_the_effect_and_leaves_the_controls_alone():
     log, _ = make_case(small(None))
-    copies = salt(log, "vibration_rectification", 6.0, np.random.default_rng(2))
+    copies = inject_effect(log, "vibration_rectification", 6.0, np.random.default_rng(2))
     record = log.rate.values
     np.testing.assert_array_equal(copies["untouched"][0].rate.values, record)
     np.testing.assert_array_equal(copies["flipped"][0].rate.values, -record)
@@ -394,13 +394,15 @@ def test_salt_on_a_log_adds_the_effect_and_leaves_the_controls_alone():
         assert set(copy.data_vars) == set(salted.data_vars)
         assert told["plan"]["kind"] == ("salted" if told["effects"] else "control")
     with pytest.raises(OptionError, match="follows restarts"):
-        salt(log, "warm_up", 2.0, np.random.default_rng(0))
+        inject_effect(log, "warm_up", 2.0, np.random.default_rng(0))
 
 
 def test_salt_on_a_log_of_counts_is_counted_and_keeps_its_mean():
     log, _ = make_case(small(None, rate=10.0, seconds=1200))
     counted = np.rint(log.rate.values / 0.5) * 0.5
-    copies = salt(log.assign(rate=(log.rate.dims, counted, log.rate.attrs)), "vibration_rectification", 8.0, np.random.default_rng(2))
+    copies = inject_effect(
+        log.assign(rate=(log.rate.dims, counted, log.rate.attrs)), "vibration_rectification", 8.0, np.random.default_rng(2)
+    )
     salted, truth = copies["salted"]
     seen = np.isfinite(counted)
     assert counts_of(counted[0]) == pytest.approx(0.5)
@@ -421,7 +423,7 @@ def test_salt_on_a_real_gyro(recordings):
     table = pd.read_csv(recordings("rlg-static-30min/lasergyro.csv.gz"), nrows=60_000)
     gyros = [column for column in table.columns if column.lower().startswith(("gyro", "w", "g"))][:3]
     log = make_log(table[gyros].to_numpy().T, rate=100.0, unit="deg/h")
-    copies = salt(log, "spectral_line", 5.0, np.random.default_rng(4))
+    copies = inject_effect(log, "spectral_line", 5.0, np.random.default_rng(4))
     added = copies["salted"][0].rate.values - log.rate.values
     assert np.abs(added).max() > 0
     assert copies["salted"][1]["effects"][0]["name"] == "spectral_line"

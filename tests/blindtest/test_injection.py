@@ -14,7 +14,7 @@ from gyrostab.blindtest.generator.detection_limits import NATS, mean_size, share
 from gyrostab.blindtest.generator.measured_noise import _slope, line_density, own_noise
 from gyrostab.blindtest.generator.record import make_log
 from gyrostab.blindtest.generator.scenario import draw_world
-from gyrostab.blindtest.scenarios.injection import rough_noise, salt
+from gyrostab.blindtest.scenarios.injection import inject_effect, rough_noise
 
 RATE, SECONDS = 20.0, 1500.0
 
@@ -115,7 +115,7 @@ def test_noise_that_is_added_counts_where_the_recording_is_quiet_only():
 def test_the_size_of_salt_is_that_in_the_noise_of_the_recording():
     record = lfilter([1.0], [1.0, -0.98], white(5))  # its slow noise is 50 times that of the shortest times
     log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
-    made, truth = salt(log, "vibration_rectification", 6.0, np.random.default_rng(6))["salted"]
+    made, truth = inject_effect(log, "vibration_rectification", 6.0, np.random.default_rng(6))["salted"]
     mean = np.asarray(made.rate.values) - record
     f = np.arange(1, record.shape[1]) * RATE / 2 / record.shape[1]
     density = 0.8**2 / RATE / abs(1 - 0.98 * np.exp(-2j * math.pi * f / RATE)) ** 2
@@ -129,7 +129,7 @@ def test_a_source_that_axes_share_is_salted_with_its_signs_and_on_its_axes_only(
     log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
     two = 0
     for seed in range(12):
-        made, truth = salt(log, "shared_source", 8.0, np.random.default_rng(seed))["salted"]
+        made, truth = inject_effect(log, "shared_source", 8.0, np.random.default_rng(seed))["salted"]
         added = np.asarray(made.rate.values) - record
         has = added.std(axis=1) > 0
         assert [str(axis) for axis in made.axis.values[has]] == truth["effects"][0]["axes"]
@@ -148,5 +148,5 @@ def test_a_spike_is_salted_above_what_the_recording_throws_by_itself():
     calm, loud = (own_noise(record, rate=RATE).jump for record in (white(8), wild))
     np.testing.assert_allclose(calm, 0.8, rtol=0.1)
     assert (loud > 1.8).all()
-    _, truth = salt(make_log(wild, {}, start=1_700_000_000 * 10**9, rate=RATE), "spikes", 4.0, np.random.default_rng(9))["salted"]
+    _, truth = inject_effect(make_log(wild, {}, start=1_700_000_000 * 10**9, rate=RATE), "spikes", 4.0, np.random.default_rng(9))["salted"]
     assert truth["effects"][0]["parameters"]["spike"]["value"] > 9.0

@@ -13,7 +13,7 @@ from scipy import stats
 
 from gyrostab.blindtest.generator.catalogue import AMBIGUITY, CATALOGUE, merged
 from gyrostab.blindtest.scoring.curves import by_effect, curves, reliability
-from gyrostab.blindtest.scoring.injections import salt_differences, salt_table
+from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.proportions import Target, spread, wilson
 from gyrostab.blindtest.scoring.score import intersection_over_union, score_case
 from gyrostab.blindtest.scoring.table import markdown, missed, score_table
@@ -281,15 +281,15 @@ def salted_rows(*, salted=(), untouched=(), flipped=(), turned=()) -> list[dict]
 
 
 def test_of_salted_recordings_only_what_salt_brings_counts():
-    (one_group,) = salt_differences(salted_rows(salted=["shupe", "spectral_line"], untouched=["spectral_line"], turned=["spikes"]))
+    (one_group,) = injection_differences(salted_rows(salted=["shupe", "spectral_line"], untouched=["spectral_line"], turned=["spikes"]))
     assert one_group["named"]
     assert (one_group["others"], one_group["flipped"], one_group["reversed"]) == ([], [], ["spikes"])
-    (again,) = salt_differences(salted_rows(salted=["warm_up", "spikes"], untouched=["ageing_bias"], flipped=["temperature_bias"]))
+    (again,) = injection_differences(salted_rows(salted=["warm_up", "spikes"], untouched=["ageing_bias"], flipped=["temperature_bias"]))
     assert again["there_before"]  # one of the set was named without salt
     assert (again["others"], again["flipped"]) == (["spikes"], [])
-    table = salt_table(salted_rows(salted=["shupe"])).set_index("quantity")
+    table = injection_table(salted_rows(salted=["shupe"])).set_index("quantity")
     assert table.loc["salt of 1.5 times the limit and more: named rightly", ["value", "n"]].tolist() == [1.0, 1]
-    assert salt_table([]).empty
+    assert injection_table([]).empty
     main = score_table(salted_rows(salted=["shupe"], untouched=["spikes"])).set_index("quantity")
     assert set(main["n"]) == {0}  # they are in no other figure
 

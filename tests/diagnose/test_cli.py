@@ -11,9 +11,9 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.core import diagnose, quiet_span
+from gyrostab.diagnose.core import diagnose, parse_quiescent_span
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.result.attribution import _can_show, spans
 from gyrostab.diagnose.result.diagnosis import check_diagnosis
 from gyrostab.diagnose.result.tables import chance_of_gain
@@ -182,7 +182,7 @@ def test_options_that_make_no_sense_are_refused(tmp_path: Path, capfd: pytest.Ca
 @pytest.mark.parametrize("text", ["", "1h", "0s/", "0s/1h/2h", "dawn/dusk", "2026-13-40/2026-14-50"])
 def test_quiet_stretches_that_cannot_be_read(text: str):
     with pytest.raises(OptionError, match="quiet"):
-        quiet_span(text)
+        parse_quiescent_span(text)
 
 
 # ------------------------------------------------------------------------------------------------------------------- pieces
@@ -199,7 +199,7 @@ def test_times_of_an_effect_are_few_or_the_whole_record():
 
 
 def test_a_line_explains_a_line_at_its_own_frequency_only():
-    line = Part(Candidate("spectral_line", "line", (), ()), Variant({}, ("amplitude",), np.empty(0)), ("x",), 50.0, place=116)
+    line = Component(Candidate("spectral_line", "line", (), ()), Variant({}, ("amplitude",), np.empty(0)), ("x",), 50.0, place=116)
     reduced = xr.Dataset(coords={"line_frequency": ("line", np.arange(1, 400) * 0.25)})
     box = {"view": "spectrum", "what": "line", "frequency": 29.25, "tau_min_s": 0.017, "tau_max_s": 0.017}
     assert _can_show(line, box, reduced)

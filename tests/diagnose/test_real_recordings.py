@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.evidence.sample_counts import coarse_lattice
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.evidence.sample_counts import has_coarse_grid
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from tests.support.scripts import load_script
@@ -70,8 +70,8 @@ def test_without_the_ramp_no_resets_are_claimed(log_of: Callable[..., Any]) -> N
 
 def test_a_lattice_as_coarse_as_the_noise_tells_of_no_dead_zone(log_of: Callable[..., Any]) -> None:
     reduced = reduce_log(log_of("rlg-static-30min"))
-    assert coarse_lattice(reduced).all()
-    level = calibrate(reduced)["coefficient"]
+    assert has_coarse_grid(reduced).all()
+    level = calibrate_noise(reduced)["coefficient"]
     found, reasons = effect_candidates(reduced, level)
     for name in ("dead_zone", "held_samples", "clipping"):
         assert "lattice" in reasons[name]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, TimeError, UnitError
 from gyrostab.ingest import read_log
-from gyrostab.ingest.concat import join_logs
+from gyrostab.ingest.concat import concatenate_logs
 from gyrostab.ingest.concat.grid import runs_of
 from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.io import datasets as export
@@ -29,7 +29,7 @@ def names(logs: list[xr.Dataset]) -> list[str]:
 
 
 def join(*logs: xr.Dataset, **options) -> xr.Dataset:
-    return join_logs(list(logs), names(list(logs)), **options)
+    return concatenate_logs(list(logs), names(list(logs)), **options)
 
 
 def table_of(log: xr.Dataset) -> np.ndarray:
@@ -114,7 +114,7 @@ def test_joining_gives_what_reading_all_source_files_gives(tmp_path: Path) -> No
         paths.append(tmp_path / f"{place}.csv")
         paths[-1].write_text("time [ns],gyro_z [deg/h]\n" + rows)
     together = regularise(read_log(paths))
-    joined = join_logs([regularise(read_log(path)) for path in paths], paths)
+    joined = concatenate_logs([regularise(read_log(path)) for path in paths], paths)
     np.testing.assert_array_equal(joined.rate, together.rate)
     assert gap_table(joined)["samples"].tolist() == [300]
 

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gyrostab.ingest.guess import EARTH_RATE_DPH, guess_columns, rate_plausibility
-from gyrostab.ingest.inspect import look_into
+from gyrostab.ingest.inspect import inspect_file
 from gyrostab.io.datasets import open_product
 from tests.support.command_line import call
 
@@ -154,14 +154,14 @@ def test_files_with_the_same_columns_are_looked_into_once(tmp_path: Path, capsys
 def test_counts_of_a_fine_gyro_are_scaled_by_the_rotation_of_the_earth(tmp_path: Path, digits: float) -> None:
     axes = np.rint(gyro_dps(fine=True) * 3600 * 1000 / digits)  # thousandths of 1, 2 or 5 deg/h
     path = write(tmp_path / "counts.csv", {"time [s]": TIME, "gx": axes[0], "gy": axes[1], "gz": axes[2]})
-    guess = guess_columns(look_into(path))
+    guess = guess_columns(inspect_file(path))
     assert guess.unit == f"{digits / 1000:g} arcsec/s"
     assert any("guess" in warning for warning in guess.warnings)
 
 
 def test_a_look_tells_range_scatter_and_rate(tmp_path: Path) -> None:
     path = write(tmp_path / "log.csv", {"time [s]": TIME, "steady": np.full(ROWS, 7.0), "noise": AZ, "words": np.full(ROWS, np.nan)})
-    look = look_into(path)
+    look = inspect_file(path)
     steady, noise, words = look.columns
     assert (steady.low, steady.high, steady.std, steady.scatter, steady.held) == (7.0, 7.0, 0.0, 0.0, 1.0)
     assert noise.scatter == pytest.approx(9.81e-3, rel=0.05)

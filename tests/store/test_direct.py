@@ -16,8 +16,8 @@ from gyrostab import make_log, open_product, to_netcdf, to_zarr
 from gyrostab.allan.fit import fit_noise, fit_part
 from gyrostab.ingest.columns.buffers import lazily
 from gyrostab.ingest.columns.pieces import Spool
-from gyrostab.ingest.concat import join_logs
-from gyrostab.ingest.concat.lazy import lay
+from gyrostab.ingest.concat import concatenate_logs
+from gyrostab.ingest.concat.lazy import place_on_grid
 from gyrostab.ingest.grid import fill
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.io.datasets import open_log
@@ -53,7 +53,7 @@ def placed(draw):
 @given(placed(), st.data())
 def test_joined_samples_are_those_of_dask(made, data):
     rows, size = made
-    joined = lay(rows, size, data.draw(st.integers(1, size)))
+    joined = place_on_grid(rows, size, data.draw(st.integers(1, size)))
     assert can_fill(joined)
     begin = data.draw(st.integers(0, size))
     for row, expected in enumerate(joined.compute(scheduler="synchronous")):
@@ -63,7 +63,7 @@ def test_joined_samples_are_those_of_dask(made, data):
 
 
 def test_what_is_derived_from_an_array_is_not_read_past_dask():
-    joined = lay([[(np.arange(9.0), None, np.array([[0, 0, 9]]))]], 9, 4)
+    joined = place_on_grid([[(np.arange(9.0), None, np.array([[0, 0, 9]]))]], 9, 4)
     doubled = 2.0 * joined
     assert not can_fill(doubled)
     assert not can_fill(joined[:, 1:])
@@ -253,7 +253,7 @@ def test_worker_processes_tell_of_damage_as_threads_do(tmp_path):
 
 def test_logs_in_memory_join_as_before():
     parts = [make_log(np.full(4, float(n)), rate=1.0, unit="deg/h", start=f"2026-01-01T00:00:0{3 * n}") for n in range(2)]
-    joined = join_logs(parts, ["a.nc", "b.nc"]).rate.data
+    joined = concatenate_logs(parts, ["a.nc", "b.nc"]).rate.data
     found = np.empty(7)
     fill_row(joined, 0, 0, found)
     np.testing.assert_array_equal(found, joined.compute()[0])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
@@ -52,5 +52,5 @@ def _made(effects: str, environment: str, seed: int) -> xr.Dataset:
 
 def nulls(reduced: xr.Dataset, count: int = 80, seed: int = 3) -> tuple[xr.Dataset, list[xr.Dataset]]:
     """Baseline of a record, and records of noise alone."""
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     return baseline, list(null_records(reduced, baseline, count=count, rng=np.random.default_rng(seed), chunk=count))

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
-from gyrostab.diagnose.statistics import VIEWS
+from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.noise import TERMS
 
 RATE, BLOCK_S, PARTS = 100.0, 20.0, 8
@@ -105,7 +105,7 @@ def smallest_p(reduced: xr.Dataset, base: xr.Dataset, null: NullScores) -> np.nd
     """The chance that a null record has a score as large as the largest of a record over all views; one for each record."""
     p = []
     for name, view in null.views.items():
-        scores = VIEWS[name](reduced, base)
+        scores = STATISTICS[name](reduced, base)
         if scores is not None:
             z = np.abs(np.nan_to_num(standardise(scores, view))).max(axis=(-3, -2, -1))
             p.append(null.p_value(name, z))

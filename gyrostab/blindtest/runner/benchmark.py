@@ -129,10 +129,10 @@ def prove(
 def _plans(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Name of each case, drawn or salted, to its plan."""
     from gyrostab.blindtest.scenarios.plan import plan_cases
-    from gyrostab.blindtest.scenarios.real import plan_salted
+    from gyrostab.blindtest.scenarios.real import plan_injections
 
     drawn = {case_name(job["seed"], plan["index"]): plan for plan in plan_cases(job["cases"], seed=job["seed"])}
-    return drawn | {case_name(job["seed"], plan["index"], plan["copy"]): plan for plan in plan_salted(job["salted"], seed=job["seed"])}
+    return drawn | {case_name(job["seed"], plan["index"], plan["copy"]): plan for plan in plan_injections(job["salted"], seed=job["seed"])}
 
 
 def _opening(job: dict[str, Any], folder: Path) -> str:

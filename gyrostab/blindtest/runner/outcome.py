@@ -13,7 +13,7 @@ import pandas as pd
 from gyrostab.blindtest.runner.figures import draw_completeness, draw_reliability
 from gyrostab.blindtest.runner.folder import TUNING, write_text
 from gyrostab.blindtest.scoring.curves import by_effect, curves, reliability
-from gyrostab.blindtest.scoring.injections import salt_differences, salt_table
+from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.score import score_case
 from gyrostab.blindtest.scoring.table import markdown, missed
 from gyrostab.store.output import replace_file
@@ -89,7 +89,7 @@ def page_text(
 
 
 def _salted(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    found = salt_differences(rows)
+    found = injection_differences(rows)
     if not found:
         return ["None: the folder of the real recordings was not given to this run, or it had too few cases."]
     lines = [
@@ -103,7 +103,7 @@ def _salted(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         "An effect is added to a piece of a real recording, which holds effects of its own; so what counts is what is claimed beside that "
         "which is claimed of the untouched piece, by the salted one and by copies of the untouched one turned in sign and in time."
     )
-    return [about, markdown(salt_table(rows)), _listed(lines, "none")]
+    return [about, markdown(injection_table(rows)), _listed(lines, "none")]
 
 
 _TURNED = {

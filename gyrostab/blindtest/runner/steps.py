@@ -18,8 +18,8 @@ __all__ = ["compare_case", "diagnose_case", "draw_case"]
 def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | None = None) -> str:
     """Write the recording and the truth of a plan unless both are there; the SHA-256 of the truth. `real` holds what is salted."""
     from gyrostab.blindtest.scenarios.case import make_case
-    from gyrostab.blindtest.scenarios.commitment import fingerprint, seal
-    from gyrostab.blindtest.scenarios.real import make_salted
+    from gyrostab.blindtest.scenarios.commitment import commit_case, fingerprint
+    from gyrostab.blindtest.scenarios.real import make_injection_case
 
     truth = directory / "truth" / f"{name}.json"
     if truth.exists():  # it is the last of the two that takes its name
@@ -28,8 +28,8 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
-        log, told = make_salted(plan, real) if real is not None and "copy" in plan else make_case(plan)
-        sha256 = seal(log, told, part, name=name)
+        log, told = make_injection_case(plan, real) if real is not None and "copy" in plan else make_case(plan)
+        sha256 = commit_case(log, told, part, name=name)
         os.replace(part / "recordings" / f"{name}.nc", directory / "recordings" / f"{name}.nc")
         os.replace(part / "truth" / f"{name}.json", truth)
     finally:

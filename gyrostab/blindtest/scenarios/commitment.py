@@ -14,7 +14,7 @@ from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.errors import FormatError
 from gyrostab.units import on_disk
 
-__all__ = ["fingerprint", "open_truth", "seal", "truth_text"]
+__all__ = ["commit_case", "fingerprint", "open_truth", "truth_text"]
 
 
 def truth_text(truth: dict[str, Any]) -> str:
@@ -49,7 +49,7 @@ def fingerprint(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def seal(log: xr.Dataset, truth: dict[str, Any], directory: str | Path, *, name: str) -> str:
+def commit_case(log: xr.Dataset, truth: dict[str, Any], directory: str | Path, *, name: str) -> str:
     """Write ``recordings/NAME.nc`` and ``truth/NAME.json``; return the SHA-256 of the latter.
 
     The recording is read as any foreign NetCDF file is, with `gyrostab.read_log`.
@@ -97,7 +97,7 @@ def open_truth(path: str | Path, *, sha256: str) -> dict[str, Any]:
     path : path
         A file of the folder ``truth``.
     sha256 : str
-        What `seal` gave.
+        What `commit_case` gave.
 
     Raises
     ------

@@ -20,7 +20,7 @@ from gyrostab.errors import OptionError
 from gyrostab.schema import check_log, signal_name
 from gyrostab.time.grid import first_stamp
 
-__all__ = ["counts_of", "rough_noise", "salt"]
+__all__ = ["counts_of", "inject_effect", "rough_noise"]
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ def _as_counted(record: Array, added: Array, rng: np.random.Generator) -> Array:
     return total
 
 
-def salt(log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator) -> dict[str, tuple[xr.Dataset, dict[str, Any]]]:
+def inject_effect(log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator) -> dict[str, tuple[xr.Dataset, dict[str, Any]]]:
     """Put an effect into a real log, and make the controls.
 
     Parameters

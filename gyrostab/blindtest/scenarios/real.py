@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.blindtest.generator.scenario import stream
-from gyrostab.blindtest.scenarios.injection import salt
+from gyrostab.blindtest.scenarios.injection import inject_effect
 
-__all__ = ["COPIES", "REAL", "make_salted", "plan_salted"]
+__all__ = ["COPIES", "REAL", "make_injection_case", "plan_injections"]
 
 #: The salted recording, and its copies without salt.
 COPIES = ("salted", "untouched", "flipped", "reversed")
@@ -52,7 +52,7 @@ _ON_THREE = (*_ON_ONE, "shared_source", "earth_rate", "scale_factor")
 _STRENGTHS = (1.5, 2.5, 4.0, 8.0)
 
 
-def plan_salted(number: int, *, seed: int) -> list[dict[str, Any]]:
+def plan_injections(number: int, *, seed: int) -> list[dict[str, Any]]:
     """Plans of `number` salted real recordings, four for each: salted, untouched, turned in sign, turned in time.
 
     Examples
@@ -85,13 +85,13 @@ def _piece(recording: str, folder: Path, part: float) -> xr.Dataset:
     return piece
 
 
-def make_salted(plan: dict[str, Any], folder: Path) -> tuple[xr.Dataset, dict[str, Any]]:
+def make_injection_case(plan: dict[str, Any], folder: Path) -> tuple[xr.Dataset, dict[str, Any]]:
     """Make one of the four logs of a salted recording and its truth.
 
     Parameters
     ----------
     plan : dict
-        One of `plan_salted`.
+        One of `plan_injections`.
     folder : pathlib.Path
         Where the real recordings are.
 
@@ -102,5 +102,5 @@ def make_salted(plan: dict[str, Any], folder: Path) -> tuple[xr.Dataset, dict[st
     """
     log = _piece(plan["recording"], folder, plan["part"])
     rng = np.random.default_rng(stream(plan["seed"], "salt", plan["index"]).integers(2**40))
-    made, truth = salt(log, plan["effect"], plan["strength"], rng)[plan["copy"]]
+    made, truth = inject_effect(log, plan["effect"], plan["strength"], rng)[plan["copy"]]
     return made, truth | {"plan": plan}

@@ -11,12 +11,12 @@ from gyrostab.blindtest.generator.catalogue import merged
 from gyrostab.blindtest.scoring.proportions import share
 from gyrostab.blindtest.scoring.table import CLEAR
 
-__all__ = ["salt_differences", "salt_table"]
+__all__ = ["injection_differences", "injection_table"]
 
 Row = Mapping[str, Any]
 
 
-def salt_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """What each salted recording, and its copies turned about, are said to hold beside what the untouched copy is.
 
     Returns
@@ -62,12 +62,12 @@ def _merged(row: Row) -> set[str]:
     return set().union(*(merged(name) for name in _said(row)))
 
 
-def salt_table(rows: Sequence[Row]) -> pd.DataFrame:
+def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
     """Shares of salted real recordings, as `score_table` gives those of drawn ones; empty where there are none.
 
     Effects count whose name the untouched copy is not given already.
     """
-    found = salt_differences(rows)
+    found = injection_differences(rows)
     if not found:
         return pd.DataFrame(columns=["quantity", "value", "low", "high", "n", "target", "state"])
     new = [one for one in found if not one["there_before"]]

@@ -58,13 +58,13 @@ def diagnose(
         Of these records.
     """
     from gyrostab.diagnose.core import diagnose as run_diagnosis
-    from gyrostab.diagnose.core import quiet_span
+    from gyrostab.diagnose.core import parse_quiescent_span
     from gyrostab.jobs.run import load_log
     from gyrostab.report.diagnosis_folder import find_foreign_file, write_diagnosis
     from gyrostab.store.output import check_output
 
     check_output(output, overwrite=common.overwrite, find_foreign=find_foreign_file)
-    spans = [quiet_span(text) for text in quiet or ()]
+    spans = [parse_quiescent_span(text) for text in quiet or ()]
     with work(common) as stage:
         stage("reading", 0)
         log = load_log(recording, **reading.options())

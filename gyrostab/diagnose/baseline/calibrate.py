@@ -14,10 +14,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, common_variance, line_columns, noise_powers, white_variance
-from gyrostab.diagnose.baseline.known_effects import evenness, known_effects
-from gyrostab.diagnose.baseline.noise_level import quiet_level, scaled_noise
+from gyrostab.diagnose.baseline.known_effects import evenness, expect_known_effects
+from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_noise
 from gyrostab.diagnose.baseline.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
-from gyrostab.diagnose.baseline.quiescent import loudness, quiet_blocks, quiet_spans
+from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks, find_quiescent_spans, loudness
 from gyrostab.diagnose.baseline.simulated import odd_band, shown_by, with_shown
 from gyrostab.diagnose.baseline.wandering import with_wandering
 from gyrostab.diagnose.evidence.products import mean_products
@@ -25,7 +25,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import HOUR, LAWS, TERMS
 from gyrostab.simulate.model import Model, read_model
 
-__all__ = ["DRAWS", "assemble", "calibrate", "from_model", "from_simulation", "grid_values"]
+__all__ = ["DRAWS", "assemble_baseline", "baseline_from_model", "baseline_from_simulation", "calibrate_noise", "grid_values"]
 
 Array = NDArray[np.float64]
 #: Draws from the posterior of the noise of an axis.
@@ -66,7 +66,7 @@ def _grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Arr
     return many[0], many[1], np.log(mass.ravel() / mass.sum())
 
 
-def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
+def calibrate_noise(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     """Calibrate the noise of every axis on quiet blocks.
 
     Parameters
@@ -106,9 +106,9 @@ def calibrate(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     >>> bool(abs(error) < 4.0), baseline.attrs["source"]
     (True, 'calibrated')
     """
-    chosen, reason = quiet_blocks(reduced, quiet)
-    attrs = {"source": "calibrated", "calibrated_on": quiet_spans(reduced, chosen), "quiet_by": reason}
-    return assemble(reduced, _posteriors(reduced, chosen), quiet=chosen, attrs=attrs)
+    chosen, reason = find_quiescent_blocks(reduced, quiet)
+    attrs = {"source": "calibrated", "calibrated_on": find_quiescent_spans(reduced, chosen), "quiet_by": reason}
+    return assemble_baseline(reduced, _posteriors(reduced, chosen), quiet=chosen, attrs=attrs)
 
 
 def _posteriors(reduced: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior]:
@@ -142,7 +142,7 @@ def _with_common(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
     return fit._replace(weight=fit.weight * min(1.0, float(known / max(np.nansum(shape), 1e-300))))
 
 
-def assemble(
+def assemble_baseline(
     reduced: xr.Dataset,
     found: list[Posterior],
     *,
@@ -151,7 +151,7 @@ def assemble(
     known_mean: Array | None = None,
     spectrum: Array | None = None,
 ) -> xr.Dataset:
-    """Put the noise of all axes into the Dataset that `calibrate` describes.
+    """Put the noise of all axes into the Dataset that `calibrate_noise` describes.
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def _ramp_error(reduced: xr.Dataset, white: Array, value: Array, quiet: NDArray[
     return error
 
 
-def from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Dataset:
+def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Dataset:
     """Take the noise of a model, and its effects as far as means and band powers show them.
 
     Parameters
@@ -251,7 +251,7 @@ def from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Data
     Returns
     -------
     xarray.Dataset
-        As `calibrate` has it; the noise has the error of that factor, or none. With ``cross(pair, block, band)``, the expected
+        As `calibrate_noise` has it; the noise has the error of that factor, or none. With ``cross(pair, block, band)``, the expected
         cross-spectrum, where axes share an effect of the model. ``attrs["left_out"]`` names the effects that show elsewhere too (in
         distributions, transfers, orders of the rotation, random wander): that part of them is not in it.
 
@@ -276,14 +276,16 @@ def from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Data
     chosen = np.ones((len(axes), reduced.sizes["block"]), np.bool_)
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": made.source}
     if quiet is not None:
-        chosen, attrs["quiet_by"] = quiet_blocks(reduced, quiet)
-        attrs["calibrated_on"] = quiet_spans(reduced, chosen)
+        chosen, attrs["quiet_by"] = find_quiescent_blocks(reduced, quiet)
+        attrs["calibrated_on"] = find_quiescent_spans(reduced, chosen)
         found = _levelled(reduced, made, found, chosen)
-    known = known_effects(reduced, made, np.stack([one.square for one in found]))
+    known = expect_known_effects(reduced, made, np.stack([one.square for one in found]))
     attrs["left_out"] = known.left_out
     hours = (reduced["begin"].values + reduced["end"].values) / (2.0 * HOUR)
     ramp = np.array([made.coefficients(axis)["R"] for axis in axes])
-    out = assemble(reduced, found, quiet=chosen, attrs=attrs, known_mean=known.mean + ramp[:, None] * hours, spectrum=known.spectrum)
+    out = assemble_baseline(
+        reduced, found, quiet=chosen, attrs=attrs, known_mean=known.mean + ramp[:, None] * hours, spectrum=known.spectrum
+    )
     out = with_wandering(out, known.wandering, known.spectrum)
     if known.cross is not None:
         out["cross"] = (("pair", "block", "band"), known.cross, {"long_name": "expected cross-spectrum", "units": _POWER})
@@ -301,20 +303,20 @@ def from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Data
 def _levelled(reduced: xr.Dataset, model: Model, found: list[Posterior], quiet: NDArray[np.bool_]) -> list[Posterior]:
     """Scale the noise of a model to the quiet blocks (axis, block) of the recording, beside its effects."""
     square = np.stack([one.square for one in found])
-    whole, added = (known_effects(reduced, model, part).spectrum for part in (square, 0.0 * square))
-    return _scaled(found, *quiet_level(reduced, whole - added, added, quiet))
+    whole, added = (expect_known_effects(reduced, model, part).spectrum for part in (square, 0.0 * square))
+    return _scaled(found, *quiescent_level(reduced, whole - added, added, quiet))
 
 
 def _scaled(found: list[Posterior], factor: Array, error: Array) -> list[Posterior]:
     every = zip(found, factor.tolist(), error.tolist(), strict=True)
-    return [scaled_noise(one, by, doubt, np.random.default_rng(row)) for row, (one, by, doubt) in enumerate(every)]
+    return [scale_noise(one, by, doubt, np.random.default_rng(row)) for row, (one, by, doubt) in enumerate(every)]
 
 
-def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
+def baseline_from_simulation(reduced: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     """Take the noise of a simulated log with the error of calibrating it, and its level over time where that changes.
 
     What it shows all the time beside the five noise terms is taken as measured: the form of its spectrum, what axes share, steady lines.
-    What a simulation does to the means over time cannot be told from its random walk, so it is not taken as known; `from_model` takes it.
+    What a simulation does to the means over time cannot be told from its random walk, so it is not taken as known; `baseline_from_model` takes it.
 
     Parameters
     ----------
@@ -335,19 +337,19 @@ def from_simulation(reduced: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = 
     ):
         if wanted != got:
             raise SchemaError(f"simulation: {name} {got}, but {wanted} in the recording; simulate with --like RECORDING")
-    chosen, reason = quiet_blocks(simulated)
+    chosen, reason = find_quiescent_blocks(simulated)
     found, level, odd = _explained(simulated, chosen)
     plain = np.einsum("abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in found])) * level[..., None]
     shown = shown_by(simulated, plain, odd)
     noise = np.einsum("abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found]))
-    attrs = {"source": "simulation", "calibrated_on": quiet_spans(simulated, chosen), "quiet_by": reason}
+    attrs = {"source": "simulation", "calibrated_on": find_quiescent_spans(simulated, chosen), "quiet_by": reason}
     spectrum = noise * level[..., None] * shown.form[:, None]
     if quiet is not None:
-        chosen, attrs["quiet_by"] = quiet_blocks(reduced, quiet)
-        attrs["calibrated_on"] = quiet_spans(reduced, chosen)
-        factor, error = quiet_level(reduced, spectrum, 0.0 * spectrum, chosen)
+        chosen, attrs["quiet_by"] = find_quiescent_blocks(reduced, quiet)
+        attrs["calibrated_on"] = find_quiescent_spans(reduced, chosen)
+        factor, error = quiescent_level(reduced, spectrum, 0.0 * spectrum, chosen)
         found, spectrum = _scaled(found, factor, error), spectrum * factor[:, None, None]
-    return with_shown(assemble(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum), shown, reduced)
+    return with_shown(assemble_baseline(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum), shown, reduced)
 
 
 def _explained(simulated: xr.Dataset, chosen: NDArray[np.bool_]) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:

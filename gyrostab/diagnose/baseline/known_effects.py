@@ -23,7 +23,15 @@ from gyrostab.physics.logger import LoggerFilter
 from gyrostab.physics.prediction import Prediction
 from gyrostab.simulate.model import Model
 
-__all__ = ["Known", "drivers_of", "evenness", "known_effects", "known_motion", "without_known_lines", "without_known_motion"]
+__all__ = [
+    "KnownEffects",
+    "evenness",
+    "expect_known_effects",
+    "expect_known_motion",
+    "find_drivers",
+    "remove_known_lines",
+    "remove_known_motion",
+]
 
 Array = NDArray[np.float64]
 _REACH, _BETWEEN = 100, 4  # ordinates on either side that a line leaks into; places of it between one and the next, on either side
@@ -35,7 +43,7 @@ _CHANCE = 5.0  # standard deviations
 _SLIGHT = 0.1  # of the noise, below which what leaks from a line is taken off as it is
 
 
-class Known(NamedTuple):
+class KnownEffects(NamedTuple):
     """Effects of a model in the statistics of a record.
 
     Attributes
@@ -64,7 +72,7 @@ class Known(NamedTuple):
     left_out: list[str]
 
 
-def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Known:
+def expect_known_effects(reduced: xr.Dataset, model: Model, square: Array) -> KnownEffects:
     """What the effects of a model make of the record.
 
     Parameters
@@ -89,7 +97,7 @@ def known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Known:
         added += power.own
     narrow = [(one.acting.effect, one.acting.rows, one.own) for one in powers if one.acting.seen.line is not None and one.factor.any()]
     sizes = {"bands": reduced.sizes["band"], "blocks": reduced.sizes["block"], "axes": reduced.sizes["axis"]}
-    return Known(
+    return KnownEffects(
         mean=_means(shown, reduced),
         spectrum=effective((noise + added) * response, reduced),
         cross=_cross(powers, response, reduced),
@@ -224,7 +232,7 @@ def _wander_squares(one: _Acting, reduced: xr.Dataset) -> dict[str, Array]:
     return squares
 
 
-def known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
+def expect_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks in which what is known of an axis moves far above its noise, (axis, block); none on an axis where that is the usual thing.
 
     The mean of such a block is known, and what moves inside it is not: its spectrum would be compared with that of noise.
@@ -240,14 +248,14 @@ def known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]
     return np.asarray(moving & (moving.mean(axis=1, keepdims=True) <= _USUAL))
 
 
-def without_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def remove_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """The record without what blocks say of their inside where what is known of an axis moves: powers, kurtosis, and what axes share there.
 
     Parameters
     ----------
     reduced, baseline : xarray.Dataset
     """
-    moving = known_motion(reduced, baseline)
+    moving = expect_known_motion(reduced, baseline)
     if not moving.any():
         return reduced
     still = xr.DataArray(~moving, dims=("axis", "block"))
@@ -332,7 +340,7 @@ def _leak(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
     return inside[:, _BETWEEN], np.average(inside, axis=1, weights=ends), inside.max(axis=1)
 
 
-def without_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def remove_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """The record with its line spectrum freed of the steady lines that the baseline knows.
 
     A line is left as it is above what is known of it where it is stronger than the form of an effect may be wrong and the noise
@@ -364,14 +372,14 @@ def _simulated(model: Model) -> Callable[[Effect], Effect]:
     return lambda effect: replace(effect, instrument=instrument) if isinstance(effect, LoggerFilter) else effect
 
 
-def drivers_of(effect: Effect) -> dict[str, str]:
+def find_drivers(effect: Effect) -> dict[str, str]:
     """Channel of the effect -> its name in the log."""
     return {role: effect.channel_names()[role] for role in effect.needs()}
 
 
 def _explained(effect: Effect, reduced: xr.Dataset, axes: tuple[str, ...], frequency: Array | None = None) -> Prediction:
     """What an effect predicts for the record on some of its axes; spectra at many frequencies in each band, since a peak may be narrow."""
-    drivers = drivers_of(effect)
+    drivers = find_drivers(effect)
     present = [str(name).removeprefix("channel_") for name in reduced.data_vars if str(name).startswith("channel_")]
     for role, name in drivers.items():
         if name not in present:

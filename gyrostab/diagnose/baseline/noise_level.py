@@ -12,14 +12,14 @@ from gyrostab.diagnose.baseline.expected_statistics import common_variance
 from gyrostab.diagnose.baseline.posterior import Posterior
 from gyrostab.errors import SchemaError
 
-__all__ = ["quiet_level", "scaled_noise"]
+__all__ = ["quiescent_level", "scale_noise"]
 
 Array = NDArray[np.float64]
 _ROUNDS = 20  # of Fisher scoring, which converges quadratically
 _LEAST = 0.1  # of the factor before, below which no round takes it: the power of noise is positive
 
 
-def quiet_level(reduced: xr.Dataset, noise: Array, added: Array, quiet: NDArray[np.bool_]) -> tuple[Array, Array]:
+def quiescent_level(reduced: xr.Dataset, noise: Array, added: Array, quiet: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Measure how loud the noise of the quiet blocks is against that of a simulation.
 
     Parameters
@@ -73,7 +73,7 @@ def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tupl
     return factor, 1.0 / (factor * math.sqrt(information))
 
 
-def scaled_noise(noise: Posterior, factor: float, error: float, rng: np.random.Generator) -> Posterior:
+def scale_noise(noise: Posterior, factor: float, error: float, rng: np.random.Generator) -> Posterior:
     """Scale the noise of an axis, with the error of the scale in its draws.
 
     Parameters

@@ -36,7 +36,7 @@ def rounded_rates(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_
     reduced : xarray.Dataset
         From `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
     baseline : xarray.Dataset
-        From `calibrate`; where it is not calibrated on this record, the noise of this record is looked up anew.
+        From `calibrate_noise`; where it is not calibrated on this record, the noise of this record is looked up anew.
 
     Returns
     -------
@@ -51,9 +51,9 @@ def rounded_rates(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_
 def _by_spectrum(reduced: xr.Dataset, baseline: xr.Dataset, step: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Axes of which the spectrum rules out the Q that their lattice would make if it were one of angles."""
     if baseline.attrs.get("source") != "calibrated":
-        from gyrostab.diagnose.baseline.calibrate import calibrate
+        from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 
-        baseline = calibrate(reduced)
+        baseline = calibrate_noise(reduced)
     rate = float(reduced.attrs["sampling_rate_hz"])
     white = baseline["square"].sel(noise="N").values * HOUR * rate
     quiet = baseline["quiet"].transpose("axis", "block").values

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
 
-__all__ = ["LEVEL_SPANS", "loudness", "quiet_blocks", "quiet_spans"]
+__all__ = ["LEVEL_SPANS", "find_quiescent_blocks", "find_quiescent_spans", "loudness"]
 
 Array = NDArray[np.float64]
 #: Blocks over which the level is averaged.
@@ -128,7 +128,7 @@ def _calm_level(reduced: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[np.boo
     return calm
 
 
-def quiet_blocks(reduced: xr.Dataset, quiet: Any = None) -> tuple[NDArray[np.bool_], str]:
+def find_quiescent_blocks(reduced: xr.Dataset, quiet: Any = None) -> tuple[NDArray[np.bool_], str]:
     """Find the blocks to calibrate on.
 
     Parameters
@@ -215,7 +215,7 @@ def _seconds(reduced: xr.Dataset, edge: Any) -> float:
     return float((instant - start) / np.timedelta64(1, "ns")) / 1e9
 
 
-def quiet_spans(reduced: xr.Dataset, quiet: NDArray[np.bool_]) -> list[list[str]]:
+def find_quiescent_spans(reduced: xr.Dataset, quiet: NDArray[np.bool_]) -> list[list[str]]:
     """Spans of time in which any axis is quiet, [start, end] as ISO times."""
     start = np.datetime64(str(reduced.attrs["start"]).removesuffix("Z"), "ms")
     some = np.concatenate([[False], quiet.any(axis=0), [False]])

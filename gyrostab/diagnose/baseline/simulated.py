@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_gains, line_skirt, local_level
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence, line_skirt, local_level
 from gyrostab.diagnose.predict.linear_model import band_widths, in_place, pair_rows
 
 __all__ = ["Shown", "odd_band", "shown_by", "with_shown"]
@@ -120,7 +120,7 @@ def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tu
         ),
         simulated["line_frequency"].values,
     )
-    gain = line_gains(power[None], weight, slope)[0]
+    gain = line_evidence(power[None], weight, slope)[0]
     lines, peaks = np.zeros(gain.shape), np.zeros(gain.shape)
     inside, near = _inside(simulated), odd.copy()
     near[:, 1:] |= odd[:, :-1]

@@ -9,16 +9,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.identification import Claim, Naming
-from gyrostab.diagnose.predict.condition import FLOOR, Part, explain_away, power_shares
+from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.predict.condition import FLOOR, Component, condition_on, power_shares
 from gyrostab.diagnose.predict.linear_model import State, begin_state, cross_column, known_cross, pair_rows
-from gyrostab.diagnose.predict.sizes import mean_mixture, part_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 
 __all__ = ["predicted"]
 
 
 def predicted(
-    naming: Naming, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None, *, left_out: Sequence[Claim] = ()
+    naming: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None, *, left_out: Sequence[Identification] = ()
 ) -> xr.Dataset:
     """The baseline with the named effects in it, fitted to the blocks that may be used.
 
@@ -48,7 +48,7 @@ def predicted(
     mine: dict[tuple[str, str], list[bool]] = {}  # of each given column: it is of an effect that is left out
     claims = (*naming.expected, *naming.claims)
     for claim in claims:
-        state = explain_away(state, list(claim.parts))
+        state = condition_on(state, list(claim.parts))
         for place, columns in state.given.items():
             known_of = mine.setdefault(place, [])
             known_of += [any(claim is one for one in left_out)] * (len(columns) - len(known_of))
@@ -86,14 +86,14 @@ def _less(state: State, baseline: xr.Dataset, mine: Mapping[tuple[str, str], Seq
     return weight
 
 
-def _shared(parts: Sequence[Part], state: State, naming: Naming) -> NDArray[np.complex128]:
+def _shared(parts: Sequence[Component], state: State, naming: Identifications) -> NDArray[np.complex128]:
     shape = state.weight.shape[1:]
     pairs = pair_rows(state.reduced)
     total = np.zeros((len(pairs), *shape), np.complex128)
     for part in parts:
         row = pairs.index(part.row)
         alone = replace(state, given={key: value for key, value in state.given.items() if key[0] != "cross"})
-        mean, _ = part_mixture(part, alone).moments()
+        mean, _ = component_mixture(part, alone).moments()
         for size, design in zip(mean, part.variant.design, strict=True):
             total[row] += size * cross_column(design, row, state.reduced)
     return total

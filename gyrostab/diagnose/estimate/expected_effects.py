@@ -10,15 +10,15 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predicted
-from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_claims
-from gyrostab.diagnose.identify.identification import Claim, Naming
-from gyrostab.diagnose.predict.condition import explain_away
+from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
+from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import begin_state
 
 __all__ = ["expected_baseline", "fit_expected", "without_expected"]
 
 
-def expected_baseline(naming: Naming, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None) -> xr.Dataset:
+def expected_baseline(naming: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None) -> xr.Dataset:
     """The baseline with the effects that were expected, and no others, fitted to the blocks that are `known`.
 
     Parameters
@@ -32,12 +32,12 @@ def expected_baseline(naming: Naming, baseline: xr.Dataset, known: NDArray[np.bo
     return predicted(replace(naming, claims=(), unknown=()), baseline, known) if naming.expected else baseline
 
 
-def fit_expected(naming: Naming, baseline: xr.Dataset) -> list[Fitted]:
+def fit_expected(naming: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """The numbers that the recording gives to the effects that were expected, with all that was named in the model."""
-    return fit_claims(replace(naming, claims=naming.expected, expected=naming.claims), baseline)
+    return fit_identifications(replace(naming, claims=naming.expected, expected=naming.claims), baseline)
 
 
-def without_expected(reduced: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Claim]) -> xr.Dataset:
+def without_expected(reduced: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]) -> xr.Dataset:
     """The record without the blocks in which effects that were expected leave odd samples, or move the rate too fast for its spectrum.
 
     Parameters
@@ -49,6 +49,6 @@ def without_expected(reduced: xr.Dataset, baseline: xr.Dataset, expected: Sequen
         return reduced
     state = begin_state(reduced, baseline)
     for claim in expected:
-        state = explain_away(state, list(claim.parts))
+        state = condition_on(state, list(claim.parts))
     moved = xr.DataArray(state.masked, dims=("axis", "block"))
     return state.reduced.assign(power=state.reduced["power"].where(~moved))

@@ -10,9 +10,9 @@ from itertools import pairwise
 import numpy as np
 
 from gyrostab.diagnose.predict.candidates import Variant, variants_of
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import Mixture, part_mixture
+from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
 from gyrostab.errors import OptionError
 from gyrostab.physics.registry import effects
 
@@ -52,7 +52,7 @@ def _scaled(variant: Variant, sizes: Mixture) -> Point:
     return Point(variant, sizes, unlikely=0.5 * float(np.linalg.slogdet(mean)[1]))
 
 
-def refined(part: Part, state: State, points: Sequence[Point]) -> list[Point]:
+def refined(part: Component, state: State, points: Sequence[Point]) -> list[Point]:
     """Points with others between them, wherever the likelihood or the size of an effect on means changes much from one to the next.
 
     The grid goes on where the likelihood still rises at its end. A step is halved about the best point, and again while its ends are likely
@@ -92,7 +92,7 @@ class _Placed:
     place: float
 
 
-def _scale(part: Part, points: Sequence[Point]) -> str | None:
+def _scale(part: Component, points: Sequence[Point]) -> str | None:
     """The first parameter of the grid that is a scale and has several values."""
     if part.candidate.view != "mean":
         return None
@@ -103,7 +103,7 @@ def _scale(part: Part, points: Sequence[Point]) -> str | None:
     return None
 
 
-def _unit(part: Part, name: str) -> str:
+def _unit(part: Component, name: str) -> str:
     return next((item.unit for item in effects()[part.candidate.effect].parameters() if item.name == name), "")
 
 
@@ -147,14 +147,14 @@ def _differ(one: Point, other: Point) -> bool:
     return bool((np.abs(mean - after) > _MOVED * np.sqrt(np.diagonal(covariance))).any())
 
 
-def _middle(part: Part, state: State, name: str, one: _Placed, other: _Placed) -> _Placed | None:
+def _middle(part: Component, state: State, name: str, one: _Placed, other: _Placed) -> _Placed | None:
     """The point in the middle of a step: of the logarithm, but from none on."""
     low, high = sorted((_value(one.point, name), _value(other.point, name)))
     value = math.sqrt(low * high) if low > high / _NONE else 0.5 * (low + high)
     return _made(part, state, name, one, value, 0.5 * (one.place + other.place))
 
 
-def _beyond(part: Part, state: State, name: str, line: Sequence[_Placed], found: Sequence[_Placed], down: bool) -> list[_Placed]:
+def _beyond(part: Component, state: State, name: str, line: Sequence[_Placed], found: Sequence[_Placed], down: bool) -> list[_Placed]:
     """Points beyond an end of a line, by steps like the last one, as long as the likelihood rises and is the largest but for `_LIKELY`.
 
     A lag longer than the record is only another slope.
@@ -173,7 +173,7 @@ def _beyond(part: Part, state: State, name: str, line: Sequence[_Placed], found:
     return out
 
 
-def _made(part: Part, state: State, name: str, like: _Placed, value: float, place: float) -> _Placed | None:
+def _made(part: Component, state: State, name: str, like: _Placed, value: float, place: float) -> _Placed | None:
     """A point of another value on the same line; None where the effect cannot have it."""
     wanted = replace(like.point.variant, values={**like.point.variant.values, name: value})
     try:
@@ -182,7 +182,7 @@ def _made(part: Part, state: State, name: str, like: _Placed, value: float, plac
         return None
     if variant is None or variant.values.get(name) != value:
         return None
-    return _Placed(_scaled(variant, part_mixture(part, state, variant)), like.line, place)
+    return _Placed(_scaled(variant, component_mixture(part, state, variant)), like.line, place)
 
 
 def _shared(found: Sequence[_Placed]) -> list[Point]:

@@ -12,23 +12,23 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.nuisance import sizes_over
-from gyrostab.diagnose.estimate.shared_factors import shared_sizes
-from gyrostab.diagnose.estimate.telegraph_sizes import level_sizes
-from gyrostab.diagnose.identify.equivalents import plainer
-from gyrostab.diagnose.identify.forward_search import Claim, Naming, Unknown
+from gyrostab.diagnose.estimate.shared_factors import estimate_shared_factors
+from gyrostab.diagnose.estimate.telegraph_sizes import estimate_telegraph
+from gyrostab.diagnose.identify.equivalents import prefer_plainer
+from gyrostab.diagnose.identify.forward_search import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.logger_filters import filter_sizes
-from gyrostab.diagnose.identify.sample_sizes import line_size, mark_sizes
-from gyrostab.diagnose.predict.condition import Part, explain_away, mirrored
+from gyrostab.diagnose.identify.sample_sizes import line_size, sample_count_sizes
+from gyrostab.diagnose.predict.condition import Component, condition_on, mirrored
 from gyrostab.diagnose.predict.filter_response import is_filter
 from gyrostab.diagnose.predict.linear_model import State, begin_state, harmonic_sets
-from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.zero_bin import cut_off
 from gyrostab.errors import GyrostabError
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 from gyrostab.physics.rotation import EarthRate
 
-__all__ = ["FORM_ERROR", "Estimate", "Fitted", "fit_claims"]
+__all__ = ["FORM_ERROR", "Estimate", "Fitted", "fit_identifications"]
 
 Array = NDArray[np.float64]
 #: Error of the form of an effect, as a share of its size: no effect is exactly what its equation says.
@@ -74,7 +74,7 @@ class Fitted:
         What the numbers do not say.
     """
 
-    claim: Claim
+    claim: Identification
     axes: tuple[str, ...]
     parameters: Mapping[str, Estimate]
     effect: Effect | None
@@ -88,7 +88,7 @@ class Fitted:
         return f"{said} {self.note}" if self.note else said
 
 
-def fit_claims(naming: Naming, baseline: xr.Dataset) -> list[Fitted]:
+def fit_identifications(naming: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """Fit all named effects, each with the others in the model.
 
     Parameters
@@ -107,16 +107,16 @@ def fit_claims(naming: Naming, baseline: xr.Dataset) -> list[Fitted]:
     found: list[Fitted] = []
     for claim in naming.claims:
         state = start
-        everything: list[Claim | Unknown] = [*naming.expected, *naming.claims, *naming.unknown]
+        everything: list[Identification | Unidentified] = [*naming.expected, *naming.claims, *naming.unknown]
         for one in everything:
             if one is not claim:
-                state = explain_away(state, list(one.parts))
+                state = condition_on(state, list(one.parts))
         state = replace(state, weight=naming.state.weight, masked=naming.state.masked)
         found += _fit_claim(claim, state, naming)
     return found
 
 
-def _fit_claim(claim: Claim, state: State, naming: Naming) -> list[Fitted]:
+def _fit_claim(claim: Identification, state: State, naming: Identifications) -> list[Fitted]:
     views = {part.candidate.view for part in claim.parts}
     kind = effects()[claim.effect]
     many = any(item.many for item in kind.parameters() if item.name in kind.size_parameters)
@@ -127,12 +127,12 @@ def _fit_claim(claim: Claim, state: State, naming: Naming) -> list[Fitted]:
     return [_fitted(claim, (axis,), [part for part in claim.parts if axis in part.row], state, naming) for axis in claim.axes]
 
 
-def _axes(claim: Claim, parts: Sequence[Part]) -> tuple[str, ...]:
+def _axes(claim: Identification, parts: Sequence[Component]) -> tuple[str, ...]:
     """Axes of the claim on which the parts are."""
     return tuple(axis for axis in claim.axes if any(axis in part.row for part in parts))
 
 
-def _by_harmonic(claim: Claim, state: State) -> list[list[Part]]:
+def _by_harmonic(claim: Identification, state: State) -> list[list[Component]]:
     """Parts of a claim; those of several harmonics of the rotation, each of which has a size and a phase of its own, one by one.
 
     A harmonic beside the strongest is left out where its amplitude is within two standard errors on every axis.
@@ -149,16 +149,16 @@ def _by_harmonic(claim: Claim, state: State) -> list[list[Part]]:
     return [[*kept[0], *rest], *kept[1:]]
 
 
-def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State, naming: Naming) -> Fitted:
+def _fitted(claim: Identification, axes: tuple[str, ...], parts: list[Component], state: State, naming: Identifications) -> Fitted:
     kind = effects()[claim.effect]
     units = {item.name: item.unit for item in kind.parameters()}
     values: dict[str, Any] = {}
     estimates: dict[str, Estimate] = {}
-    by_view: dict[str, list[Part]] = {}
+    by_view: dict[str, list[Component]] = {}
     for part in parts:
         by_view.setdefault(part.candidate.view, []).append(part)
     view = max(by_view, key=lambda name: sum(part.gain for part in by_view[name]))
-    plain = [plainer(part, state) for part in by_view[view]]
+    plain = [prefer_plainer(part, state) for part in by_view[view]]
     by_view[view] = [part for part, _ in plain]
     filtered = is_filter(view, by_view[view][0].variant)
     sizes: Mapping[str, tuple[float, ...]]
@@ -179,7 +179,7 @@ def _fitted(claim: Claim, axes: tuple[str, ...], parts: list[Part], state: State
 
 
 def _elsewhere(
-    by_view: Mapping[str, list[Part]], view: str, axes: tuple[str, ...], state: State, naming: Naming
+    by_view: Mapping[str, list[Component]], view: str, axes: tuple[str, ...], state: State, naming: Identifications
 ) -> dict[str, tuple[float, ...]]:
     """Sizes on axes that the strongest view says nothing of, from the strongest of the others that does."""
     seen = {axis for part in by_view[view] for axis in part.row}
@@ -207,7 +207,7 @@ def _put(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...])
     known[axes.index(axis)] = value
 
 
-def _words(claim: Claim, part: Part, state: State) -> dict[str, Any]:
+def _words(claim: Identification, part: Component, state: State) -> dict[str, Any]:
     """What the model needs beside the numbers."""
     if claim.effect == "rotation_line":
         return {"harmonics": 1.0}
@@ -259,7 +259,7 @@ def _estimate(mean: float, sd: float, unit: str, *, positive: bool, form: float,
 # ---------------------------------------------------------------------------------------------------------------- sizes
 
 
-def _linear(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
+def _linear(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, ...]]:
     """Parameters of means, powers, profiles and transfers; by axis where there are several."""
     out: dict[str, tuple[float, ...]] = {}
     for part in parts:
@@ -281,11 +281,11 @@ def _root(square: float, sd: float) -> tuple[float, float]:
     return value, sd / (2.0 * value) if square > sd else math.sqrt(max(square, 0.0) + sd) - value
 
 
-def _common(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
-    return shared_sizes(parts, axes, state)
+def _common(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, ...]]:
+    return estimate_shared_factors(parts, axes, state)
 
 
-def _turning(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, ...]]:
+def _turning(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, ...]]:
     """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down.
 
     Angles have the error of the form that the amplitude has: a share of an angle would be none.
@@ -312,14 +312,14 @@ def _latitude(across: float, error: float) -> tuple[float, float, float, float]:
     return middle, max((high - low) / (2.0 * _TWO_SIDED), 1e-12), low, high
 
 
-def _amplitude(part: Part, state: State) -> tuple[float, float, float]:
+def _amplitude(part: Component, state: State) -> tuple[float, float, float]:
     """Amplitude of the first harmonic of a part, its standard error, and the phase [deg]."""
-    mean, covariance = part_mixture(part, state).moments()
+    mean, covariance = component_mixture(part, state).moments()
     sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
     return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
 
 
-def _line(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
+def _line(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, float]]:
     name = {"real_motion": "sway"}.get(parts[0].candidate.effect, parts[0].variant.columns[0])
     out: dict[str, tuple[float, float]] = {}
     for part in sorted(parts, key=lambda part: part.gain):  # of several lines of an axis the strongest
@@ -329,12 +329,12 @@ def _line(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming
     return out
 
 
-def _odd(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
-    return mark_sizes(parts[0].candidate.effect, parts[0].variant.columns[0], parts[0].row[0], state.reduced, naming.tallies)
+def _odd(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, float]]:
+    return sample_count_sizes(parts[0].candidate.effect, parts[0].variant.columns[0], parts[0].row[0], state.reduced, naming.tallies)
 
 
-def _levels(parts: list[Part], axes: tuple[str, ...], state: State, naming: Naming) -> dict[str, tuple[float, float]]:
-    return level_sizes(parts, axes, state)
+def _levels(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, float]]:
+    return estimate_telegraph(parts, axes, state)
 
 
 _SIZES: Mapping[str, Callable[..., Mapping[str, tuple[float, ...]]]] = {

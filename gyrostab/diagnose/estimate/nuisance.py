@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.grid_refinement import Point, refined
 from gyrostab.diagnose.identify.forward_search import AMBIGUOUS, FORM
-from gyrostab.diagnose.identify.identification import Naming
+from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.predict.candidates import Variant
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import Mixture, part_mixture
+from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
 from gyrostab.physics.registry import effects
 
 __all__ = ["plain_places", "sizes_over"]
@@ -24,7 +24,7 @@ _AT_ONCE = 1e-2  # s: a lag that is as good as none
 _TAILS = (0.025, 0.975)
 
 
-def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
+def sizes_over(part: Component, state: State, naming: Identifications) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
     """Sizes of a part, averaged over the noise and over what else is free.
 
     An exponent has its default and a lag is none, unless other values are better by 3 nats and an error of the form. The scatter of the
@@ -47,7 +47,7 @@ def sizes_over(part: Part, state: State, naming: Naming) -> tuple[Array, Array, 
         Value and standard deviation of the others, and the ends of the 95 % interval where that is not symmetric; NaN for one that is told,
         but not measured.
     """
-    grid = [Point(variant, part_mixture(part, state, variant)) for variant in _family(part, naming)]
+    grid = [Point(variant, component_mixture(part, state, variant)) for variant in _family(part, naming)]
     usual = _usual(part, [point.variant for point in grid], [point.evidence for point in grid])
     points = refined(part, state, [grid[place] for place in usual])
     family = [point.variant for point in points]
@@ -80,7 +80,7 @@ def _merged(points: Sequence[Point]) -> Mixture:
     return Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
 
 
-def _family(part: Part, naming: Naming) -> list[Variant]:
+def _family(part: Component, naming: Identifications) -> list[Variant]:
     """Variants of the part with the same columns: the grid."""
     candidate = next(
         (one for one in naming.candidates if one.key == part.candidate.key and one.view == part.candidate.view), part.candidate
@@ -95,7 +95,7 @@ def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
     return [place for place, one in enumerate(family) if all(one.values.get(name, known[name]) == known[name] for name in tried)]
 
 
-def _usual(part: Part, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
+def _usual(part: Component, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
     """Places of the plain variants, unless others are clearly better."""
     plain, top = plain_places(part.candidate.effect, family), max(evidence)
     return plain if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS else list(range(len(family)))

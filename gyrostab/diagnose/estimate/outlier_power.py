@@ -12,12 +12,12 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.predict.candidates import windows_of
 from gyrostab.diagnose.predict.designs import term_density
 
-__all__ = ["with_odd_power"]
+__all__ = ["add_outlier_power"]
 
 _IN_ALL = "lattice"  # odd about every sample, so that the noise that was calibrated has it already
 
 
-def with_odd_power(baseline: xr.Dataset, reduced: xr.Dataset, fitted: Sequence[Fitted]) -> xr.Dataset:
+def add_outlier_power(baseline: xr.Dataset, reduced: xr.Dataset, fitted: Sequence[Fitted]) -> xr.Dataset:
     """The baseline with the mean power of spikes, held samples and other odd samples, as their fitted numbers and their physics say.
 
     Parameters

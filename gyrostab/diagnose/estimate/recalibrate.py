@@ -9,21 +9,21 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.calibrate import DRAWS, assemble
+from gyrostab.diagnose.baseline.calibrate import DRAWS, assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import common_variance, noise_powers, white_variance
-from gyrostab.diagnose.baseline.known_effects import drivers_of
+from gyrostab.diagnose.baseline.known_effects import find_drivers
 from gyrostab.diagnose.baseline.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior
-from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, Fitted, fit_claims
-from gyrostab.diagnose.identify.identification import Naming
+from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, Fitted, fit_identifications
+from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.predict.candidates import variants_of, windows_of
-from gyrostab.diagnose.predict.condition import Part, explain_away, odd_blocks, take_part
+from gyrostab.diagnose.predict.condition import Component, condition_on, condition_on_component, find_anomalous_blocks
 from gyrostab.diagnose.predict.filter_response import is_filter, response_of
-from gyrostab.diagnose.predict.linear_model import State, begin_state, effective, witness_power
-from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.predict.linear_model import State, begin_state, effective, reference_channel_power
+from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.base import Effect
 from gyrostab.physics.phase import fold
 
-__all__ = ["recalibrate", "with_noise", "without_hops"]
+__all__ = ["recalibrate", "remove_fast_switching", "with_noise"]
 
 Array = NDArray[np.float64]
 _GROUPS = 150  # of blocks of like level, over which powers are averaged
@@ -55,7 +55,9 @@ class _Seen:
     doubt: float = 2.0 * FORM_ERROR
 
 
-def recalibrate(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], known: NDArray[np.bool_] | None = None) -> xr.Dataset:
+def recalibrate(
+    naming: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted], known: NDArray[np.bool_] | None = None
+) -> xr.Dataset:
     """Calibrate the noise with the named effects in the model, those of free size free.
 
     An axis that no effect touches keeps its noise; so does one on which effects leave too little to tell it by. Where something is
@@ -74,7 +76,7 @@ def recalibrate(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], 
     Returns
     -------
     xarray.Dataset
-        As `gyrostab.diagnose.baseline.calibrate.calibrate` has it; ``attrs["recalibrated"]`` names the axes.
+        As `gyrostab.diagnose.baseline.calibrate.calibrate_noise` has it; ``attrs["recalibrated"]`` names the axes.
     """
     if baseline.attrs.get("source") != "calibrated" or not naming.claims:
         return baseline
@@ -82,7 +84,7 @@ def recalibrate(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], 
     use = np.ones(reduced.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
     state = begin_state(reduced, baseline)
     for claim in naming.claims:
-        state = explain_away(state, list(claim.parts))
+        state = condition_on(state, list(claim.parts))
     found: list[Posterior] = []
     power = baseline["spectrum"].transpose("axis", "block", "band").values.copy()
     columns = noise_powers(reduced)
@@ -102,7 +104,7 @@ def recalibrate(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], 
         found.append(_kept(baseline, row) if posterior is None else posterior)
     if not changed:
         return baseline
-    out = assemble(reduced, found, quiet=quiet, attrs={**baseline.attrs, "recalibrated": changed}, spectrum=power)
+    out = assemble_baseline(reduced, found, quiet=quiet, attrs={**baseline.attrs, "recalibrated": changed}, spectrum=power)
     out["columns"] = out["columns"].copy(data=columns)
     for row, axis in enumerate(state.axes):
         if axis not in changed:
@@ -118,7 +120,7 @@ _OF_AXIS = (
 )  # fmt: skip
 
 
-def without_hops(naming: Naming, baseline: xr.Dataset) -> xr.Dataset:
+def remove_fast_switching(naming: Identifications, baseline: xr.Dataset) -> xr.Dataset:
     """The noise beside biases that hop within blocks alone: with these for noise it is another one, to which nothing can be compared.
 
     Parameters
@@ -131,7 +133,7 @@ def without_hops(naming: Naming, baseline: xr.Dataset) -> xr.Dataset:
     if not hops:
         return baseline
     alone = replace(naming, claims=hops, unknown=())
-    noise = recalibrate(alone, baseline, fit_claims(alone, baseline))
+    noise = recalibrate(alone, baseline, fit_identifications(alone, baseline))
     return noise if noise is baseline else noise.assign_attrs(recalibrated=[])
 
 
@@ -145,7 +147,7 @@ def _kept(baseline: xr.Dataset, row: int) -> Posterior:
     return Posterior(one["square"].values, one["square_stderr"].values, K, B, weight / weight.sum(), draws, slow, True)
 
 
-def _seen(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: str) -> _Seen | None:
+def _seen(naming: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: str) -> _Seen | None:
     """What all named effects do on an axis; None where they do nothing."""
     reduced = naming.state.reduced
     shape = (reduced.sizes["block"], reduced.sizes["band"])
@@ -167,12 +169,12 @@ def _seen(naming: Naming, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: 
     return out if touched else None
 
 
-def _only_said(part: Part, reduced: xr.Dataset) -> bool:
+def _only_said(part: Component, reduced: xr.Dataset) -> bool:
     """Whether the power of a part is in no column, but only in what the effect says of itself; with odd samples it may be left out."""
-    return part.candidate.view == "cross" or (part.candidate.view == "marks" and not odd_blocks(part, reduced).any())
+    return part.candidate.view == "cross" or (part.candidate.view == "marks" and not find_anomalous_blocks(part, reduced).any())
 
 
-def _add(out: _Seen, part: Part, naming: Naming, baseline: xr.Dataset, axis: str) -> None:
+def _add(out: _Seen, part: Component, naming: Identifications, baseline: xr.Dataset, axis: str) -> None:
     view = part.candidate.view
     state = begin_state(naming.state.reduced, baseline)
     if is_filter(view, part.variant):
@@ -182,22 +184,22 @@ def _add(out: _Seen, part: Part, naming: Naming, baseline: xr.Dataset, axis: str
     elif view == "phase_locked":
         out.known += _comb(part, replace(state, weight=naming.state.weight))
     elif view in ("mean", "levels", "power", "order", "line"):
-        given = take_part(state, part).given
+        given = condition_on_component(state, part).given
         out.free += [np.broadcast_to(one, out.known.shape) for one in given.get(("power", axis), [])]
         out.means += given.get(("mean", axis), [])
 
 
-def _followed(part: Part, state: State) -> Array:
+def _followed(part: Component, state: State) -> Array:
     """Power that follows a channel or another axis, (block, band)."""
-    mean, _ = part_mixture(part, state).moments()
+    mean, _ = component_mixture(part, state).moments()
     transfer = np.tensordot(mean, part.variant.design, axes=1)
-    return np.asarray(np.abs(transfer) ** 2 * np.nan_to_num(witness_power(part.candidate.witness[0], state.reduced)))
+    return np.asarray(np.abs(transfer) ** 2 * np.nan_to_num(reference_channel_power(part.candidate.witness[0], state.reduced)))
 
 
-def _comb(part: Part, state: State) -> Array:
+def _comb(part: Component, state: State) -> Array:
     """Power of what is locked to the ramp: the lines of its mean over a turn, folded as samples see them, (block, band)."""
     reduced = state.reduced
-    mean, _ = part_mixture(part, state).moments()
+    mean, _ = component_mixture(part, state).moments()
     profile = np.tensordot(mean, part.variant.design, axes=1)
     square = np.abs(np.fft.rfft(profile)[1:] / profile.size) ** 2
     turns, rate = np.abs(reduced["ramp_turns"].values), float(reduced.attrs["sampling_rate_hz"])
@@ -212,7 +214,7 @@ def _comb(part: Part, state: State) -> Array:
 
 def _said(effect: Effect, reduced: xr.Dataset, axis: str) -> Array:
     """Power that an effect says it has on an axis, (block, band)."""
-    windows = replace(windows_of(reduced, drivers_of(effect)), axes=(axis,))
+    windows = replace(windows_of(reduced, find_drivers(effect)), axes=(axis,))
     out = np.zeros((reduced.sizes["block"], reduced.sizes["band"]))
     many = {item.name: item.many for item in effect.parameters()}
     for name, density in effect.explain(windows).spectrum.items():
@@ -291,7 +293,7 @@ def _fit(power: Array, shape: Array, columns: Array, expected: Array, seen: _See
     return Fit(flat[0], flat[1], weight[some], known=flat[2], beside=beside, precision=precision, start=flat[3])
 
 
-def with_noise(naming: Naming, baseline: xr.Dataset) -> Naming:
+def with_noise(naming: Identifications, baseline: xr.Dataset) -> Identifications:
     """The naming with designs for another noise: a share of N^2 is a share of the new one.
 
     Parameters
@@ -308,7 +310,7 @@ def with_noise(naming: Naming, baseline: xr.Dataset) -> Naming:
             made = [variants_of(one, variant, reduced, baseline["coefficient"]) or variant for variant in one.variants]
             swapped[id(one)] = (one, replace(one, variants=tuple(made)))
 
-    def part_of(part: Part) -> Part:
+    def part_of(part: Component) -> Component:
         if id(part.candidate) not in swapped:
             return part
         old, new = swapped[id(part.candidate)]

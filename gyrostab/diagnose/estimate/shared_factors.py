@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.candidates import Variant, variants_of
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State, cross_column, pair_rows
-from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 
-__all__ = ["shared_sizes"]
+__all__ = ["estimate_shared_factors"]
 
 Array = NDArray[np.float64]
 _DRAWS = 1000
@@ -26,7 +26,7 @@ _ORDER = 0.05  # by which the level below a low-pass is another where it has two
 _ENDS = (0.025, 0.975)
 
 
-def shared_sizes(parts: Sequence[Part], axes: tuple[str, ...], state: State) -> dict[str, tuple[float, ...]]:
+def estimate_shared_factors(parts: Sequence[Component], axes: tuple[str, ...], state: State) -> dict[str, tuple[float, ...]]:
     """Factor of every axis, with its standard error and the ends of its 95 % interval, and the low-pass of what is shared.
 
     White noise and low-passes of any bandwidth are weighed by the cross-spectra of all pairs. No axis shares more than it has. One pair
@@ -95,7 +95,7 @@ class _Seen(NamedTuple):
     limit: Array
 
 
-def _seen(part: Part, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State) -> _Seen:
+def _seen(part: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State) -> _Seen:
     """White noise is as likely beforehand as all low-passes together; what lies between two bandwidths of the grid is smooth."""
     from scipy.interpolate import CubicSpline
 
@@ -114,13 +114,13 @@ def _seen(part: Part, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], st
     return _Seen(widths, share, table[:, 1 : 1 + count], table[:, 1 + count : 1 + 2 * count], table[:, 1 + 2 * count :])
 
 
-def _of_width(part: Part, width: float, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State) -> Array:
+def _of_width(part: Component, width: float, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State) -> Array:
     """Logarithm of the likelihood of a low-pass, products of the factors of each pair, their errors, and limits of the axes."""
     variant = part.variant
     if "bandwidth" in variant.values:
         other = replace(variant, values={**variant.values, "bandwidth": width})
         variant = variants_of(part.candidate, other, state.reduced, state.baseline["coefficient"]) or variant
-    moments = [part_mixture(replace(part, row=row), state, variant).moments() for row in rows]
+    moments = [component_mixture(replace(part, row=row), state, variant).moments() for row in rows]
     product, square = (np.array([float(one.flat[0]) for one in several]) for several in zip(*moments, strict=True))
     limit = [_level(axis, variant, state) for axis in axes]
     return np.concatenate([[0.5 * float((product**2 / square).sum())], product, np.sqrt(square), limit])

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 
-__all__ = ["level_sizes"]
+__all__ = ["estimate_telegraph"]
 
 
-def level_sizes(parts: Sequence[Part], axes: tuple[str, ...], state: State) -> dict[str, tuple[float, float]]:
+def estimate_telegraph(parts: Sequence[Component], axes: tuple[str, ...], state: State) -> dict[str, tuple[float, float]]:
     """Step of every axis [degree hour-1] and mean times on both levels [s], each with its error.
 
     Parameters
@@ -36,7 +36,7 @@ def level_sizes(parts: Sequence[Part], axes: tuple[str, ...], state: State) -> d
     course = first.design[0, 0]
     out: dict[str, tuple[float, float]] = {}
     for part in ranked:
-        mean, covariance = part_mixture(part, state).moments()
+        mean, covariance = component_mixture(part, state).moments()
         own = part.variant.design[0, 0]
         sign = 1.0 if part is ranked[0] or float(np.cov(own, course)[0, 1]) >= 0.0 else -1.0
         label = name if len(axes) == 1 else f"{name}.{part.row[0]}"

@@ -12,14 +12,14 @@ from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.estimate.nuisance import plain_places
-from gyrostab.diagnose.identify.identification import Naming
-from gyrostab.diagnose.predict.condition import Part, mean_columns
+from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.predict.condition import Component, mean_columns
 from gyrostab.diagnose.predict.designs import Candidate, Variant
 from gyrostab.diagnose.predict.linear_model import State, pair_rows
-from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
 
-__all__ = ["Limit", "limits", "mixture_limit"]
+__all__ = ["UpperLimit", "find_upper_limits", "mixture_limit"]
 
 _LEVEL = 0.95
 _MOST = 9  # variants
@@ -27,7 +27,7 @@ _ONE_SIDED = float(ndtri(_LEVEL))  # standard errors
 
 
 @dataclass(frozen=True)
-class Limit:
+class UpperLimit:
     """An effect that was not found: how large it may be, at 95 %; NaN where the record cannot tell."""
 
     upper_limit: float
@@ -35,7 +35,7 @@ class Limit:
     reason: str
 
 
-def limits(naming: Naming) -> dict[str, Limit]:
+def find_upper_limits(naming: Identifications) -> dict[str, UpperLimit]:
     """How large every effect that was not named may be.
 
     Returns
@@ -50,16 +50,16 @@ def limits(naming: Naming) -> dict[str, Limit]:
             continue
         unit = next((item.unit for item in kind.parameters() if item.name in kind.size_parameters), "1")
         if name in naming.reasons:
-            out[name] = Limit(math.nan, unit, naming.reasons[name])
+            out[name] = UpperLimit(math.nan, unit, naming.reasons[name])
             continue
         found = [_limit(one, naming.state) for one in naming.candidates if one.effect == name and one.view in ("mean", "power", "cross")]
         known = [(value, column) for value, column in found if math.isfinite(value)]
         if not known:
-            out[name] = Limit(math.nan, unit, "not identifiable: free noise does as much" if found else "below limit")
+            out[name] = UpperLimit(math.nan, unit, "not identifiable: free noise does as much" if found else "below limit")
             continue
         value, column = max(known)
         unit = next((item.unit for item in kind.parameters() if item.name == column), unit)
-        out[name] = Limit(value, unit, "below limit")
+        out[name] = UpperLimit(value, unit, "below limit")
     return out
 
 
@@ -69,7 +69,7 @@ def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
         return math.nan, ""
     family = _told_over(candidate, [one for one in candidate.variants if one.columns == candidate.variants[0].columns])
     rows = pair_rows(state.reduced) if candidate.view == "cross" else [(axis,) for axis in state.axes]
-    found = [_of_row(Part(candidate, family[0], row, 0.0), family, state) for row in rows]
+    found = [_of_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows]
     known = [bound for bound in found if math.isfinite(bound)]
     worst = max(known) if known else math.nan
     return (math.sqrt(worst) if family[0].squared else worst), family[0].columns[0]
@@ -82,10 +82,10 @@ def _told_over(candidate: Candidate, family: Sequence[Variant]) -> Sequence[Vari
     return plain[every // 2 :: every] if plain else [family[len(family) // 2]]
 
 
-def _of_row(part: Part, family: Sequence[Variant], state: State) -> float:
+def _of_row(part: Component, family: Sequence[Variant], state: State) -> float:
     """The number that the size, or its square, is below at 95 %, on an axis or a pair; NaN where the record cannot tell."""
     moves = [one for one in family if part.candidate.view != "mean" or np.ptp(mean_columns(one, state.axes.index(part.row[0]))[0]) > 0.0]
-    sizes = [part_mixture(part, state, one) for one in moves]
+    sizes = [component_mixture(part, state, one) for one in moves]
     moments = [(float(mean[0]), math.sqrt(max(float(square[0, 0]), 0.0))) for mean, square in (one.moments() for one in sizes)]
     usable = [place for place, (mean, sd) in enumerate(moments) if math.isfinite(mean) and math.isfinite(sd) and sd > 0.0]
     if not usable:

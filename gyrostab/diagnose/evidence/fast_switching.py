@@ -14,11 +14,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.products import WIDTHS, mean_products, take_out
-from gyrostab.diagnose.evidence.telegraph import HOPS, Courses, course_evidence, level_courses, usual_courses, waves
+from gyrostab.diagnose.evidence.telegraph import MEAN_SWITCHES, TelegraphCourses, course_evidence, telegraph_courses, usual_courses, waves
 from gyrostab.kernels.spectra.periodogram import band_edges, band_powers, gap_spectra, ordinates, taper
 from gyrostab.physics.lorentz import lorentz_density
 
-__all__ = ["Hops", "hop_gain", "hop_powers"]
+__all__ = ["SwitchingEvidence", "switching_evidence", "switching_powers"]
 
 Array = NDArray[np.float64]
 #: Nats by which two levels must be better than normal noise of any spectrum.
@@ -38,13 +38,13 @@ _STARTS = ((0.05, 0.95), (0.25, 0.75), (0.25, 0.99), (0.01, 0.75), (0.5, 0.999),
 
 
 @dataclass(frozen=True)
-class Hops:
+class SwitchingEvidence:
     """A bias of two levels that hops within blocks.
 
     Attributes
     ----------
     gain : float
-        Lower bound of the log Bayes factor against noise [nats]; -inf where there are fewer than `HOPS` hops, or where normal
+        Lower bound of the log Bayes factor against noise [nats]; -inf where there are fewer than `MEAN_SWITCHES` hops, or where normal
         noise of any spectrum does as well but for `NORMAL` nats.
     share : ndarray, shape (block, piece)
         Of each piece on the upper level.
@@ -63,7 +63,7 @@ class Hops:
     refuted: bool = False
 
 
-def hop_gain(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None) -> Hops | None:
+def switching_evidence(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None) -> SwitchingEvidence | None:
     """What two levels gain in means over pieces of blocks.
 
     Parameters
@@ -71,7 +71,7 @@ def hop_gain(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array 
     data : xarray.Dataset
         One reduced record with ``piece_mean`` (axis block inner) [degree hour-1] and ``piece_samples``.
     baseline : xarray.Dataset
-        As for `gyrostab.diagnose.evidence.telegraph.level_gains`.
+        As for `gyrostab.diagnose.evidence.telegraph.telegraph_evidence`.
     axis : str
     given : ndarray, shape (block, piece, column), optional
         Columns that are in the model with and without it.
@@ -86,29 +86,29 @@ def hop_gain(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array 
     values, variance, together = _pieces(data, baseline, axis)
     shape = values.shape
     present = (np.isfinite(values) & np.isfinite(variance)).ravel()
-    if present.sum() < 10.0 * HOPS or np.ptp(values.ravel()[present]) == 0.0:
+    if present.sum() < 10.0 * MEAN_SWITCHES or np.ptp(values.ravel()[present]) == 0.0:
         return None
     step = float(data.attrs["block_s"]) / shape[1]
     n = present.size
     flat = np.where(present, values.ravel(), 0.0)[:, None]
     variance = np.where(present, variance.ravel(), 1.0)
     own = np.empty((n, 0)) if given is None else _grouped(given, together).reshape(n, -1)
-    best: Hops | None = None
+    best: SwitchingEvidence | None = None
     for count in (0, 8):
         beside = np.concatenate([waves(n, count), own], axis=1)
-        found = level_courses(flat, variance, present, beside, starts=_STARTS, least=_QUIETEST, parts=_PARTS)
+        found = telegraph_courses(flat, variance, present, beside, starts=_STARTS, least=_QUIETEST, parts=_PARTS)
         gain, beyond = _worth(found, flat, variance, present, own, step, baseline.sel(axis=axis))
         gain -= np.log(2.0)
         share = np.repeat(found.share[0].reshape(shape), together, axis=1)
-        seen = found.hops[0] >= HOPS and gain > 0.0
+        seen = found.hops[0] >= MEAN_SWITCHES and gain > 0.0
         alike = seen and _like_two_levels(found, variance, present)
         good, refuted = alike and beyond > NORMAL, seen and gain > _SURE and (not alike or beyond < -_SURE)
-        one = Hops(gain if good else -np.inf, share, found.times[0] * step, float(found.hops[0]), bool(refuted))
+        one = SwitchingEvidence(gain if good else -np.inf, share, found.times[0] * step, float(found.hops[0]), bool(refuted))
         best = one if best is None or one.gain > best.gain else replace(best, refuted=best.refuted and one.refuted)
     return best
 
 
-def _like_two_levels(found: Courses, variance: Array, present: NDArray[np.bool_]) -> bool:
+def _like_two_levels(found: TelegraphCourses, variance: Array, present: NDArray[np.bool_]) -> bool:
     """Whether the bias is between the levels as rarely as one is that hops like this.
 
     More levels, or a wave, are followed as well by hops that are fast enough; but shares of neighbouring pieces are not alike then.
@@ -152,7 +152,7 @@ def _grouped(given: Array, together: int) -> Array:
 
 
 def _worth(
-    found: Courses, values: Array, variance: Array, present: NDArray[np.bool_], given: Array, step: float, baseline: xr.Dataset
+    found: TelegraphCourses, values: Array, variance: Array, present: NDArray[np.bool_], given: Array, step: float, baseline: xr.Dataset
 ) -> tuple[float, float]:
     """Evidence of the course over that of white noise with a walk, and over that of normal noise of any spectrum [nats]."""
     K, B, prior = _slow(baseline)
@@ -212,7 +212,7 @@ def _slow(baseline: xr.Dataset) -> tuple[Array, Array, Array]:
     return K[chosen], B[chosen], free[chosen] - np.logaddexp.reduce(free[chosen])
 
 
-def _scales(found: Courses, values: Array, variance: Array, present: NDArray[np.bool_]) -> Array:
+def _scales(found: TelegraphCourses, values: Array, variance: Array, present: NDArray[np.bool_]) -> Array:
     """White levels that are tried, over the expected one: that, more, and what differences of neighbours say with a course and without."""
     both = present[1:] & present[:-1]
     seen = [1.0, 2.0, 4.0]
@@ -222,7 +222,7 @@ def _scales(found: Courses, values: Array, variance: Array, present: NDArray[np.
     return np.unique(np.maximum(seen, 1e-12))
 
 
-def hop_powers(share: Array, low: float, high: float, size: int, rate: float) -> Array:
+def switching_powers(share: Array, low: float, high: float, size: int, rate: float) -> Array:
     """Band powers within blocks of a bias of two levels, for a step of one.
 
     At frequencies that pieces tell, those of the course; beyond, those of hops at random instants, as many as each block has.

@@ -37,15 +37,15 @@ from gyrostab.diagnose.evidence.wandering import known_wander
 from gyrostab.errors import OptionError
 
 __all__ = [
-    "Cells",
+    "LinearModel",
     "Tier",
-    "cell_factors",
     "independent",
+    "linear_model_factors",
+    "mean_evidence",
     "mean_factors",
-    "mean_gains",
     "noise_columns",
+    "power_evidence",
     "power_factors",
-    "power_gains",
     "score",
 ]
 
@@ -172,7 +172,7 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
     return columns[..., free], np.diag(1.0 / np.square(error[free]))
 
 
-class Cells(NamedTuple):
+class LinearModel(NamedTuple):
     """Data that are independent from cell to cell, as a linear model.
 
     Attributes
@@ -194,17 +194,17 @@ class Cells(NamedTuple):
     precision: Array
 
 
-def independent(cells: Cells, common: Array, unit: Array | None = None) -> Cells:
+def independent(cells: LinearModel, common: Array, unit: Array | None = None) -> LinearModel:
     """The same model with independent cells, where those of a block rise and fall together; see `share_out`."""
     weight = np.where(np.isfinite(cells.weight) & np.isfinite(cells.values).all(axis=2), cells.weight, 0.0)
     seen = weight[..., None] > 0.0
     values, given, *designs = (
         share_out(np.where(seen & np.isfinite(one), one, 0.0), weight, common, unit) for one in (cells.values, cells.given, *cells.designs)
     )
-    return Cells(values, weight, designs, given, cells.precision)
+    return LinearModel(values, weight, designs, given, cells.precision)
 
 
-def cell_factors(cells: Cells, folds: xr.DataArray) -> Array:
+def linear_model_factors(cells: LinearModel, folds: xr.DataArray) -> Array:
     """Factors of designs in independent cells.
 
     Parameters
@@ -300,8 +300,8 @@ def power_factors(
     wide = np.diag([*np.diagonal(precision), *[-1.0] * beside.shape[2]])
     columns, numbers = _columns(designs, shape)
     each = [columns[:, chosen].reshape(*shape, -1) for chosen in numbers]
-    cells = Cells(values, weight, each, np.concatenate([level, beside], axis=2), wide)
-    return cell_factors(independent(cells, baseline["common"].sel(axis=axis).values), fold_blocks(data) if folds is None else folds)
+    cells = LinearModel(values, weight, each, np.concatenate([level, beside], axis=2), wide)
+    return linear_model_factors(independent(cells, baseline["common"].sel(axis=axis).values), fold_blocks(data) if folds is None else folds)
 
 
 def _gains(factors: Array, candidates: Mapping[str, Sequence[Array]]) -> xr.DataArray:
@@ -315,7 +315,7 @@ def _gains(factors: Array, candidates: Mapping[str, Sequence[Array]]) -> xr.Data
     )
 
 
-def mean_gains(
+def mean_evidence(
     data: xr.Dataset, baseline: xr.Dataset, candidates: Mapping[str, Sequence[Array]], *, axis: str, tier: Tier = "free", **more: Any
 ) -> xr.DataArray:
     """Held-out gains of candidates in the block means.
@@ -336,9 +336,9 @@ def mean_gains(
     return _gains(mean_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates)
 
 
-def power_gains(
+def power_evidence(
     data: xr.Dataset, baseline: xr.Dataset, candidates: Mapping[str, Sequence[Array]], *, axis: str, tier: Tier = "free", **more: Any
 ) -> xr.DataArray:
-    """Held-out gains of candidates in the band powers; as `mean_gains`, with the designs of `power_factors`."""
+    """Held-out gains of candidates in the band powers; as `mean_evidence`, with the designs of `power_factors`."""
     designs = [design for several in candidates.values() for design in several]
     return _gains(power_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates)

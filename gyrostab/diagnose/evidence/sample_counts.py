@@ -12,13 +12,13 @@ from gyrostab.diagnose.evidence.folds import FOLDS
 
 __all__ = [
     "COUNTS",
-    "OF_LATTICE",
+    "GRID_COUNTS",
     "Expected",
     "beyond_ends",
-    "coarse_lattice",
-    "count_gains",
+    "count_evidence",
     "expected_counts",
-    "kurtosis_gains",
+    "has_coarse_grid",
+    "kurtosis_evidence",
     "still_scatter",
 ]
 
@@ -26,13 +26,13 @@ Array = NDArray[Any]
 #: Counts of blocks that effects raise.
 COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
 #: Statistics of the distribution that a coarse lattice makes by itself.
-OF_LATTICE = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
+GRID_COUNTS = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
 _COARSE, _STILL = 0.2, 0.1  # step in scatters of the samples; share of the blocks that tell the scatter at rest
 _ENDS = 2  # samples that are the smallest and the largest of any record
 _SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
 
 
-def coarse_lattice(reduced: xr.Dataset) -> NDArray[np.bool_]:
+def has_coarse_grid(reduced: xr.Dataset) -> NDArray[np.bool_]:
     """Axes whose lattice is so coarse that equal samples, zeros and tails are its own, and tell of nothing else.
 
     Parameters
@@ -136,7 +136,7 @@ def _held_out(evidence: Array, lengths: int) -> Array:
     return np.asarray((evidence[0] - parts).sum(axis=1).max(axis=0))
 
 
-def count_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
+def count_evidence(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
     """Held-out gain of a raised count.
 
     Parameters
@@ -158,8 +158,8 @@ def count_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.b
     return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
 
 
-def kurtosis_gains(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
-    """Held-out gain of a higher kurtosis; `mean` and `spread` are those of a block, (axis,); the rest as in `count_gains`."""
+def kurtosis_evidence(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
+    """Held-out gain of a higher kurtosis; `mean` and `spread` are those of a block, (axis,); the rest as in `count_evidence`."""
     z = np.clip(np.where(np.isfinite(values), (values - mean[:, None]) / spread[:, None], 0.0), -8.0, 8.0)
     found = []
     for subset in subsets:

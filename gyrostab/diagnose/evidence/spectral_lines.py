@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
 
-__all__ = ["LEAK", "expected_lines", "level_about", "line_gains", "line_skirt", "local_level"]
+__all__ = ["LEAK", "expected_lines", "level_about", "line_evidence", "line_skirt", "local_level"]
 
 Array = NDArray[Any]
 #: Lines on each side that a steady line leaks into.
@@ -34,7 +34,7 @@ def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
     return smooth + baseline["peaks"].values if "peaks" in baseline else smooth
 
 
-def line_gains(power: Array, weight: Array, expected: Array | None = None) -> Array:
+def line_evidence(power: Array, weight: Array, expected: Array | None = None) -> Array:
     """Gain of a steady line on the parts of the record that were held out, less the logarithm of the number of lines.
 
     The level is that of the lines around, in every part for itself, and not below those next to it on either side: a slope or a broad

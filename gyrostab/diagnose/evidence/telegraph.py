@@ -22,13 +22,13 @@ from gyrostab.diagnose.evidence.wandering import known_wander
 from gyrostab.kernels.regression.evidence import mixed_evidence
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
-__all__ = ["HOPS", "Courses", "course_evidence", "level_courses", "level_gains", "usual_courses", "waves"]
+__all__ = ["MEAN_SWITCHES", "TelegraphCourses", "course_evidence", "telegraph_courses", "telegraph_evidence", "usual_courses", "waves"]
 
 Array = NDArray[np.float64]
 #: Parts of a block, each on one level.
 PARTS = 4
 #: Hops that it takes: one or two are jumps.
-HOPS = 5.0
+MEAN_SWITCHES = 5.0
 _SHORTEST, _FIRST = 0.5, 5.0  # blocks: the shortest mean time on a level, and the one that the search begins with
 #: Quantiles of the means that may be levels.
 STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
@@ -37,7 +37,7 @@ _DRIFTS = (0, 8)  # waves of a drift
 
 
 @dataclass(frozen=True)
-class Courses:
+class TelegraphCourses:
     """Biases of two levels, one for every record.
 
     Attributes
@@ -68,7 +68,7 @@ class Courses:
     scale: Array
 
 
-def level_courses(
+def telegraph_courses(
     values: Array,
     variance: Array,
     present: NDArray[np.bool_],
@@ -77,7 +77,7 @@ def level_courses(
     starts: Sequence[tuple[float, float]] = STARTS,
     least: float = 1.0,
     parts: int = PARTS,
-) -> Courses:
+) -> TelegraphCourses:
     """Courses of biases of two levels in white noise, by expectation and maximisation from several starts.
 
     Parameters
@@ -185,7 +185,7 @@ def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, le
     return fit, log
 
 
-def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> Courses:
+def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> TelegraphCourses:
     """What a fit says, with the upper level above the lower one."""
     log, share, square, up, total = _smoothed(fit, y, weight, beside)
     seen = weight > 0.0
@@ -193,7 +193,7 @@ def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> Courses:
     expected = -0.5 * (total / fit.scale - np.log(weight[seen] / (2.0 * np.pi)).sum() + seen.sum() * np.log(fit.scale))
     hops = 2.0 * up + share[:, 0] - share[:, -1]
     turned = fit.size[:, -1] < 0.0
-    return Courses(
+    return TelegraphCourses(
         share=np.where(turned[:, None], 1.0 - share, share),
         spread=spread,
         step=np.abs(fit.size[:, -1]),
@@ -206,7 +206,7 @@ def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> Courses:
 
 
 def usual_courses(
-    found: Courses, variance: Array, present: NDArray[np.bool_], *, parts: int, count: int, rng: np.random.Generator
+    found: TelegraphCourses, variance: Array, present: NDArray[np.bool_], *, parts: int, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Logarithms of the likelihood (record,), and shares (record, block), that means of two levels have that hop as it was found.
 
@@ -215,7 +215,7 @@ def usual_courses(
     found : Courses
         Of one record.
     variance, present
-        As for `level_courses`.
+        As for `telegraph_courses`.
     parts : int
         Of a block.
     count : int
@@ -248,7 +248,7 @@ def _unknown(hops: Array, blocks: int) -> Array:
     return np.asarray(2.0 * np.log(max(np.log(2.0 * blocks), 1.0)) + np.maximum(np.log(np.maximum(hops, 1.0) / (4.0 * np.pi)), 0.0))
 
 
-def level_gains(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None) -> tuple[Array, Courses]:
+def telegraph_evidence(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None) -> tuple[Array, TelegraphCourses]:
     """Gains of a bias of two levels on an axis.
 
     Parameters
@@ -264,7 +264,7 @@ def level_gains(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Arr
     Returns
     -------
     gain : ndarray, shape (record,)
-        Lower bound of the log Bayes factor [nats]; -inf where there are fewer than `HOPS` hops.
+        Lower bound of the log Bayes factor [nats]; -inf where there are fewer than `MEAN_SWITCHES` hops.
     courses : Courses
     """
     mean = (data["mean"] - baseline["known_mean"]).sel(axis=axis)
@@ -286,11 +286,11 @@ def level_gains(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Arr
     safe = np.where(present[:, None], values, 0.0)
     tried = []
     for count in _DRIFTS:
-        found = level_courses(safe, variance, present, np.concatenate([waves(n, count), own], axis=1))
+        found = telegraph_courses(safe, variance, present, np.concatenate([waves(n, count), own], axis=1))
         worth = _worth(found, safe, own, frame, grid, log_weight) - np.log(len(_DRIFTS))
-        tried.append((np.where(found.hops >= HOPS, worth, -np.inf), found))
+        tried.append((np.where(found.hops >= MEAN_SWITCHES, worth, -np.inf), found))
     chosen = np.argmax([gain for gain, _ in tried], axis=0)
-    best = Courses(*(_picked([getattr(one, item.name) for _, one in tried], chosen) for item in fields(Courses)))
+    best = TelegraphCourses(*(_picked([getattr(one, item.name) for _, one in tried], chosen) for item in fields(TelegraphCourses)))
     return _picked([gain for gain, _ in tried], chosen), best
 
 
@@ -299,7 +299,7 @@ def waves(n: int, count: int) -> Array:
     return np.asarray(np.cos(np.pi * (np.arange(n)[:, None] + 0.5) / n * np.arange(count + 1)))
 
 
-def _worth(found: Courses, values: Array, given: Array, frame: dict[str, Any], grid: dict[str, Any], log_weight: Array) -> Array:
+def _worth(found: TelegraphCourses, values: Array, given: Array, frame: dict[str, Any], grid: dict[str, Any], log_weight: Array) -> Array:
     """Evidence of the courses over that of none, less what they cost; the scatter of a course counts as a datum that has no step."""
     records, beside = values.shape[1], given.shape[1]
     columns = np.concatenate([found.share.T, given], axis=1)

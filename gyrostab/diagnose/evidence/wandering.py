@@ -35,7 +35,7 @@ def known_wander(baseline: xr.Dataset, axis: str | int) -> Wander:
     Parameters
     ----------
     baseline : xarray.Dataset
-        Of `gyrostab.diagnose.baseline.calibrate.from_model`, with ``wander_square`` (axis, wander), ``wander_time`` (wander) and
+        Of `gyrostab.diagnose.baseline.calibrate.baseline_from_model`, with ``wander_square`` (axis, wander), ``wander_time`` (wander) and
         ``wander_walk`` (axis, block); nothing without these.
     axis : str or int
         Name, or number.

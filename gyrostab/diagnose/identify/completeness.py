@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.posterior import scales
 from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.identify.identification import Claim
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import mean_mixture
 from gyrostab.noise import HOUR
 
-__all__ = ["flexible", "redness", "unrest"]
+__all__ = ["excess_low_frequency_noise", "flexible", "variance_fluctuation"]
 
 Array = NDArray[np.float64]
 _STEPS = (1.0, 3.0, 10.0, 30.0)  # of the flicker and random walk that just show
 _LOUDEST = 8.0  # standard deviations that the level of one block may be away
 
 
-def flexible(state: State, claims: Sequence[Claim], axis: str) -> State:
+def flexible(state: State, claims: Sequence[Identification], axis: str) -> State:
     """The state with the next points of the nuisance grids beside those named: a time constant lies between two of them."""
     row = state.axes.index(axis)
     for part in (part for one in claims for part in one.parts if part.candidate.view == "mean" and part.row == (axis,)):
@@ -35,7 +35,7 @@ def flexible(state: State, claims: Sequence[Claim], axis: str) -> State:
     return state
 
 
-def redness(state: State, axis: str, folds: xr.DataArray) -> float:
+def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> float:
     """What free random walk and flicker gain over the calibrated ones, with all that is named in the model [nats].
 
     Zero where the noise is less red than calibrated: a calibration on blocks that an effect touches takes it for noise.
@@ -52,10 +52,10 @@ def redness(state: State, axis: str, folds: xr.DataArray) -> float:
     return float(evidence[0] - evidence[1]) if strength[0] > strength[1] else 0.0
 
 
-def unrest(state: State, axis: str) -> float:
+def variance_fluctuation(state: State, axis: str) -> float:
     """What a level of the powers that wanders freely, as flicker and random walk do, gains over one that stands still [nats].
 
-    The level is that of all bands of a block together, over the one expected with all that is named. It is the twin of `redness`: where
+    The level is that of all bands of a block together, over the one expected with all that is named. It is the twin of `excess_low_frequency_noise`: where
     something is left, the noise changes in another way than what is named says.
     """
     row = state.axes.index(axis)

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 
 from gyrostab.diagnose.predict.candidates import Variant
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 
-__all__ = ["plainer"]
+__all__ = ["prefer_plainer"]
 
 _ALIKE = 0.999  # correlation of the errors of two terms, from which on they are one to the data
 _AMBIGUOUS = 3.0  # nats by which one term alone must be better than another
 _NEEDED, _FORM = 6.0, 0.01  # nats that a second term must bring, and of the first one's, which an error of its form may leave
 
 
-def plainer(part: Part, state: State) -> tuple[Part, str]:
+def prefer_plainer(part: Component, state: State) -> tuple[Component, str]:
     """The part with one of its terms, where that does as well as all, and a sentence about it; else the part as it is.
 
     A part of one term gets the first of those that alone do as well, but for 3 nats and an error of the form.
@@ -36,7 +36,7 @@ def plainer(part: Part, state: State) -> tuple[Part, str]:
         return part, ""
     if len(part.variant.columns) == 1:
         return _first_alike(part, state)
-    mean, covariance = part_mixture(part, state).moments()
+    mean, covariance = component_mixture(part, state).moments()
     error = np.sqrt(np.diagonal(covariance))
     alike = float(np.abs(np.tril(covariance / np.outer(error, error), -1)).max())
     found = ((name, _only(part, name)) for name in part.variant.columns)
@@ -53,7 +53,7 @@ def plainer(part: Part, state: State) -> tuple[Part, str]:
     return replace(part, variant=alone[name]), _untold(name, others)
 
 
-def _first_alike(part: Part, state: State) -> tuple[Part, str]:
+def _first_alike(part: Component, state: State) -> tuple[Component, str]:
     """A part of one term: by the first of the terms that alone do as well, whichever rounding or chance had put ahead."""
     names = dict.fromkeys(one.columns[0] for one in part.candidate.variants if len(one.columns) == 1)
     terms = [one for name in names if (one := _only(part, name)) is not None]
@@ -65,9 +65,9 @@ def _first_alike(part: Part, state: State) -> tuple[Part, str]:
     return replace(part, variant=first), _untold(first.columns[0], [one.columns[0] for one in others])
 
 
-def _alone(part: Part, state: State, variant: Variant) -> float:
+def _alone(part: Component, state: State, variant: Variant) -> float:
     """What a single term gains over none [nats]; nothing where it would take power away."""
-    size, spread = part_mixture(part, state, variant).moments()
+    size, spread = component_mixture(part, state, variant).moments()
     possible = max(float(size[0]), 0.0) if variant.squared else float(size[0])
     return 0.5 * possible**2 / float(spread[0, 0])
 
@@ -77,7 +77,7 @@ def _untold(name: str, others: Sequence[str]) -> str:
     return f"The record does not tell its {name} from its {' and '.join(others)}, which {taken} taken as 0."
 
 
-def _only(part: Part, name: str) -> Variant | None:
+def _only(part: Component, name: str) -> Variant | None:
     """The variant of the same values with this term alone."""
     for one in part.candidate.variants:
         if one.columns == (name,) and one.squared == part.variant.squared and one.values == part.variant.values:

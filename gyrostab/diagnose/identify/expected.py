@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from gyrostab.diagnose.identify.components import LEAST, axes_of, by_key, gain_sum
-from gyrostab.diagnose.identify.identification import Claim
+from gyrostab.diagnose.identify.components import LEAST, axes_of, by_key, sum_evidence
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Candidate
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Found
 from gyrostab.physics.base import Effect
 
-__all__ = ["expected_claims"]
+__all__ = ["identify_expected_effects"]
 
 _ROUNDS = 6
 _ONCE = {"telegraph": "bias_jump"}  # a hop that does not come back
 
 
-def expected_claims(
+def identify_expected_effects(
     known: Sequence[Effect], candidates: Sequence[Candidate], start: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
-) -> tuple[list[Claim], State]:
+) -> tuple[list[Identification], State]:
     """Claims of effects that are expected, and the state with them in it; whatever else is named has to stand beside them.
 
     Their sizes are free, for the model says how often something happens and the recording when. The strongest comes first, but odd
@@ -38,25 +38,25 @@ def expected_claims(
     gains : callable
         Gains of candidates in a state.
     """
-    claims: list[Claim] = []
+    claims: list[Identification] = []
     state, left = start, list(known)
     rounds = _ROUNDS * len(left)
     while left and rounds > 0:
         rounds -= 1
         found = [(_parts(effect, candidates, state, gains), effect) for effect in left]
-        left = [effect for parts, effect in found if gain_sum(parts) > LEAST]
-        parts, effect = max(found, key=lambda one: (_odd(one[0]), gain_sum(one[0])))
-        if gain_sum(parts) <= LEAST:
+        left = [effect for parts, effect in found if sum_evidence(parts) > LEAST]
+        parts, effect = max(found, key=lambda one: (_odd(one[0]), sum_evidence(one[0])))
+        if sum_evidence(parts) <= LEAST:
             break
         claims.append(_claim(parts, state))
-        state = explain_away(state, parts)
+        state = condition_on(state, parts)
         if _odd(parts):  # their counts cannot be taken out
             left = [one for one in left if one is not effect]
     return claims, state
 
 
-def _odd(parts: Sequence[Part]) -> bool:
-    return bool(parts) and parts[0].candidate.view == "marks" and gain_sum(parts) > LEAST
+def _odd(parts: Sequence[Component]) -> bool:
+    return bool(parts) and parts[0].candidate.view == "marks" and sum_evidence(parts) > LEAST
 
 
 def _follows(candidate: Candidate, effect: Effect) -> bool:
@@ -67,13 +67,13 @@ def _follows(candidate: Candidate, effect: Effect) -> bool:
 
 def _parts(
     effect: Effect, candidates: Sequence[Candidate], state: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
-) -> list[Part]:
+) -> list[Component]:
     """What an effect brings on its axes, in the views and with the channels in which it brings most."""
     by = by_key(gains([one for one in candidates if _follows(one, effect)], state))
     own = [[part for part in parts if not effect.axes or set(part.row) <= set(effect.axes)] for parts in by.values()]
-    return max(own, key=gain_sum, default=[])
+    return max(own, key=sum_evidence, default=[])
 
 
-def _claim(parts: Sequence[Part], state: State) -> Claim:
+def _claim(parts: Sequence[Component], state: State) -> Identification:
     first = parts[0].candidate
-    return Claim(first.effect, first.driver, axes_of(parts, state.axes), tuple(parts), gain_sum(parts), LEAST)
+    return Identification(first.effect, first.driver, axes_of(parts, state.axes), tuple(parts), sum_evidence(parts), LEAST)

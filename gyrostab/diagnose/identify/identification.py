@@ -10,13 +10,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.components import LEAST, axes_of, gain_sum
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.identify.components import LEAST, axes_of, sum_evidence
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.designs import Candidate
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import Tallies
+from gyrostab.diagnose.predict.search import CountEvidence
 
-__all__ = ["Claim", "Naming", "Unknown", "form_error", "unknown_of", "with_axes_of", "with_claim"]
+__all__ = ["Identification", "Identifications", "Unidentified", "add_identification", "find_unidentified", "form_error", "with_axes_of"]
 
 Array = NDArray[np.float64]
 #: What an error of the spectrum of a driven noise leaves to a filter, as a share of its gain: 0.08 was seen in loud vibration.
@@ -24,7 +24,7 @@ _FILTER, _SPECTRUM = "logger_filter", 0.1
 
 
 @dataclass(frozen=True)
-class Claim:
+class Identification:
     """An effect that is named.
 
     Attributes
@@ -49,7 +49,7 @@ class Claim:
     effect: str
     driver: tuple[str, ...]
     axes: tuple[str, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[Component, ...]
     gain: float
     threshold: float
     alternatives: tuple[str, ...] = ()
@@ -57,7 +57,7 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Unknown:
+class Unidentified:
     """Something is there that no effect explains.
 
     Attributes
@@ -78,11 +78,11 @@ class Unknown:
     gain: float
     threshold: float
     candidates: tuple[str, ...] = ()
-    parts: tuple[Part, ...] = ()
+    parts: tuple[Component, ...] = ()
 
 
 @dataclass(frozen=True)
-class Naming:
+class Identifications:
     """What naming found.
 
     Attributes
@@ -106,16 +106,16 @@ class Naming:
         Effects that the simulation has as well, with the size and course that the recording gives them; they are in `state` too.
     """
 
-    claims: tuple[Claim, ...]
-    unknown: tuple[Unknown, ...]
+    claims: tuple[Identification, ...]
+    unknown: tuple[Unidentified, ...]
     threshold: float
     null_best: Array
     reasons: dict[str, str]
     candidates: tuple[Candidate, ...]
     state: State
     folds: xr.DataArray
-    tallies: Tallies = field(default_factory=lambda: Tallies({}))
-    expected: tuple[Claim, ...] = ()
+    tallies: CountEvidence = field(default_factory=lambda: CountEvidence({}))
+    expected: tuple[Identification, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -125,10 +125,12 @@ class Naming:
         return "partly explained" if self.unknown else "explained"
 
 
-def with_claim(chosen: Sequence[Claim | Unknown], one: Claim | Unknown) -> list[Claim | Unknown]:
+def add_identification(
+    chosen: Sequence[Identification | Unidentified], one: Identification | Unidentified
+) -> list[Identification | Unidentified]:
     """The list with another claim; one of the same effect and channel becomes one with it, but for lines of other frequencies."""
     for place, other in enumerate(chosen):
-        if isinstance(one, Claim) and isinstance(other, Claim) and _same(one, other):
+        if isinstance(one, Identification) and isinstance(other, Identification) and _same(one, other):
             axes = tuple(sorted({*other.axes, *one.axes}))
             alike = tuple(dict.fromkeys([*other.alternatives, *one.alternatives]))
             both = replace(other, axes=axes, parts=(*other.parts, *one.parts), gain=other.gain + one.gain, alternatives=alike)
@@ -136,24 +138,24 @@ def with_claim(chosen: Sequence[Claim | Unknown], one: Claim | Unknown) -> list[
     return [*chosen, one]
 
 
-def with_axes_of(claim: Claim, again: Mapping[str, Sequence[Part]]) -> Claim:
+def with_axes_of(claim: Identification, again: Mapping[str, Sequence[Component]]) -> Identification:
     """A claim without the axes on which it no longer brings anything, by its parts that were found with the others in the model."""
     seen = {axis for part in again.get(claim.parts[0].candidate.key, []) if part.gain > LEAST for axis in part.row}
     kept = tuple(part for part in claim.parts if set(part.row) <= seen)
     return replace(claim, parts=kept, axes=tuple(axis for axis in claim.axes if axis in seen)) if kept else claim
 
 
-def _same(one: Claim, other: Claim) -> bool:
+def _same(one: Identification, other: Identification) -> bool:
     lines = {part.place for claim in (one, other) for part in claim.parts if part.candidate.view == "line"}
     return (one.effect, one.driver) == (other.effect, other.driver) and len(lines) < 2
 
 
-def unknown_of(key: str, parts: Sequence[Part], threshold: float, near: Sequence[str]) -> Unknown:
+def find_unidentified(key: str, parts: Sequence[Component], threshold: float, near: Sequence[str]) -> Unidentified:
     """What a generic found; `near` are the effects that come nearest."""
-    return Unknown(key, axes_of(parts, ()), gain_sum(parts), threshold, tuple(dict.fromkeys(near)), tuple(parts))
+    return Unidentified(key, axes_of(parts, ()), sum_evidence(parts), threshold, tuple(dict.fromkeys(near)), tuple(parts))
 
 
-def form_error(parts: Sequence[Part], chosen: Sequence[Claim | Unknown], *, share: float) -> float:
+def form_error(parts: Sequence[Component], chosen: Sequence[Identification | Unidentified], *, share: float) -> float:
     """What errors of the form of what is named already may leave in the views and axes of these parts [nats].
 
     A steady line leaves nothing at other frequencies: what it leaks into is taken out with it. What follows a channel has a course in time
@@ -165,16 +167,16 @@ def form_error(parts: Sequence[Part], chosen: Sequence[Claim | Unknown], *, shar
     for one in chosen:
         for part in one.parts:
             beside = [effect for view, axes, effect in views if view in _leaves(part) and axes & set(part.row)]
-            of_spectrum = part.candidate.view == "power" and isinstance(one, Claim) and bool(one.driver) and _FILTER in beside
+            of_spectrum = part.candidate.view == "power" and isinstance(one, Identification) and bool(one.driver) and _FILTER in beside
             error += max(_SPECTRUM if of_spectrum else 0.0, share) * part.gain if beside else 0.0
     return error
 
 
-def _leaves(part: Part) -> tuple[str, ...]:
+def _leaves(part: Component) -> tuple[str, ...]:
     """Views in which an error of the form of a part shows: a harmonic that is not quite where it should be is power, and shared."""
     return ("order", "power", "cross") if part.candidate.view == "order" else (_kind(part),)
 
 
-def _kind(part: Part) -> str:
+def _kind(part: Component) -> str:
     """View of a part, for what it leaves to others: two levels are seen in the means."""
     return "mean" if part.candidate.view == "levels" else part.candidate.view

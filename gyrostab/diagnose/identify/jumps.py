@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import Mixture, mean_mixture, part_mixture
+from gyrostab.diagnose.predict.sizes import Mixture, component_mixture, mean_mixture
 
-__all__ = ["jumps_at_will", "levels", "stays", "sudden"]
+__all__ = ["is_lasting", "is_sudden", "jumps_at_will", "levels"]
 
 Array = NDArray[np.float64]
 _JUMP, _INSTANT = "bias_jump", "at"
@@ -24,7 +24,7 @@ _LOUDER = (10.0, 100.0, 1e3, 1e4, 1e5)  # times the usual variance of the means
 _SURE = 3.0  # standard errors of the level after an event, from which on it is another than before
 
 
-def jumps_at_will(part: Part, state: State) -> bool:
+def jumps_at_will(part: Component, state: State) -> bool:
     """Whether a part is a jump at an instant of its own choice, and not one at which power came back."""
     if part.candidate.effect != _JUMP or part.candidate.view != "mean" or _INSTANT not in part.variant.values:
         return False
@@ -32,7 +32,7 @@ def jumps_at_will(part: Part, state: State) -> bool:
     return not np.isclose(ends, float(part.variant.values[_INSTANT])).any()
 
 
-def sudden(parts: Sequence[Part], state: State, *, error: float = 0.0) -> bool:
+def is_sudden(parts: Sequence[Component], state: State, *, error: float = 0.0) -> bool:
     """Whether jumps step, rather than go over from one level to the other within some blocks.
 
     Where a straight way of four or eight blocks about the same instant says more on all axes together, something else came and went.
@@ -54,7 +54,7 @@ def sudden(parts: Sequence[Part], state: State, *, error: float = 0.0) -> bool:
     return over - step <= _BETTER + error + _FORM * sum(max(part.gain, 0.0) for part in jumps)
 
 
-def stays(parts: Sequence[Part], state: State) -> bool:
+def is_lasting(parts: Sequence[Component], state: State) -> bool:
     """Whether the means stay on another level after jumps, rather than come back.
 
     What lasts for two blocks to a tenth of the record before or after the instant, and says more than a level that stays, on all axes
@@ -81,7 +81,7 @@ def stays(parts: Sequence[Part], state: State) -> bool:
     return any(_other_level(part, state, spans[best]) for part in jumps)
 
 
-def levels(parts: Sequence[Part], state: State) -> bool:
+def levels(parts: Sequence[Component], state: State) -> bool:
     """Whether jumps lead to levels, and are not the wildest of means that scatter more for a while.
 
     Waves slower than a block make means scatter, and of such means any two that follow each other are a jump. So the jumps must say
@@ -99,10 +99,10 @@ def levels(parts: Sequence[Part], state: State) -> bool:
     return not jumps or sum(_beside_scatter(part, state) for part in jumps) > -_BETTER
 
 
-def _beside_scatter(part: Part, state: State) -> float:
+def _beside_scatter(part: Component, state: State) -> float:
     """Logarithm of the Bayes factor of a jump of about the size that it has, where the means may scatter more for a while [nats]."""
     variances = _scatter(part, state)
-    jump = [part_mixture(part, state, variance=one) for one in variances]
+    jump = [component_mixture(part, state, variance=one) for one in variances]
     none = [mean_mixture(state, part.row[0], [], variance=one) for one in variances]
     with_it, without = (np.array([np.logaddexp.reduce(one.log_weight) for one in several]) for several in (jump, none))
     likely = jump[int(with_it.argmax())]
@@ -112,7 +112,7 @@ def _beside_scatter(part: Part, state: State) -> float:
     return float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without) - np.log(wide) - 0.5 - instants)
 
 
-def _scatter(part: Part, state: State) -> list[Array]:
+def _scatter(part: Component, state: State) -> list[Array]:
     """White variances of the means: the usual one, and louder ones for stretches before, after and about the instant of a jump."""
     axis, blocks = part.row[0], state.reduced.sizes["block"]
     block = np.arange(blocks)
@@ -124,7 +124,7 @@ def _scatter(part: Part, state: State) -> list[Array]:
     return [usual, *(np.where(here, factor * usual, usual) for here in inside for factor in _LOUDER)]
 
 
-def _spans(part: Part, state: State) -> list[tuple[int, int]]:
+def _spans(part: Component, state: State) -> list[tuple[int, int]]:
     """First block and the one behind the last of events that begin or end at the instant of a jump, and at no end of the record."""
     block, blocks = float(state.reduced.attrs["block_s"]), state.reduced.sizes["block"]
     at = round(float(part.variant.values[_INSTANT]) / block)
@@ -133,23 +133,23 @@ def _spans(part: Part, state: State) -> list[tuple[int, int]]:
     return [(first, stop) for first, stop in both if first >= _LEAST_BESIDE and stop <= blocks - _LEAST_BESIDE]
 
 
-def _events(part: Part, state: State, span: tuple[int, int]) -> tuple[Mixture, Mixture]:
+def _events(part: Component, state: State, span: tuple[int, int]) -> tuple[Mixture, Mixture]:
     """Sizes of an event of so many blocks; and those of it and of the level behind it."""
     block = np.arange(state.reduced.sizes["block"])
     shape = part.variant.design.shape
     during = np.broadcast_to(((block >= span[0]) & (block < span[1])).astype(np.float64), shape)
     behind = np.broadcast_to((block >= span[1]).astype(np.float64), shape)
     alone, both = (replace(part.variant, design=one) for one in (during, np.concatenate([during, behind])))
-    return part_mixture(part, state, alone), part_mixture(part, state, both)
+    return component_mixture(part, state, alone), component_mixture(part, state, both)
 
 
-def _other_level(part: Part, state: State, span: tuple[int, int]) -> bool:
+def _other_level(part: Component, state: State, span: tuple[int, int]) -> bool:
     """Whether the level behind an event is surely another than the one before it."""
     size, covariance = _events(part, state, span)[1].moments()
     return bool(abs(size[-1]) > _SURE * np.sqrt(covariance[-1, -1]))
 
 
-def _evidence(part: Part, state: State, length: int) -> float:
+def _evidence(part: Component, state: State, length: int) -> float:
     """Logarithm of the evidence of a level that goes over within so many blocks, whatever its size; 0 for the jump itself."""
     variant = part.variant
     if length:
@@ -157,4 +157,4 @@ def _evidence(part: Part, state: State, length: int) -> float:
         middle = (np.arange(state.reduced.sizes["block"]) + 0.5) * block - float(variant.values[_INSTANT])
         way = np.clip(middle / (length * block) + 0.5, 0.0, 1.0)
         variant = replace(variant, design=np.broadcast_to(way, variant.design.shape))
-    return float(np.logaddexp.reduce(part_mixture(part, state, variant).log_weight))
+    return float(np.logaddexp.reduce(component_mixture(part, state, variant).log_weight))

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
 from gyrostab.diagnose.baseline.posterior import Fit, expected_of
 from gyrostab.diagnose.predict.candidates import Candidate
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.filter_response import is_filter, response_of
 from gyrostab.diagnose.predict.linear_model import State, in_place
-from gyrostab.diagnose.predict.search import gains
-from gyrostab.diagnose.predict.sizes import part_size
+from gyrostab.diagnose.predict.search import compute_evidence
+from gyrostab.diagnose.predict.sizes import component_size
 from gyrostab.physics.registry import effects
 
 __all__ = ["filter_sizes", "on_all_axes", "without_slopes"]
@@ -29,7 +29,7 @@ _NEXT, _ELSEWHERE, _TAIL, _TWO_SIDED = 0.25, 0.02, 0.025, 1.959964  # reach of a
 _APART, _FORM = 6.0, 0.1  # nats by which axes may disagree by chance; and of the gain, what an error of the spectrum may leave
 
 
-def without_slopes(passing: list[str], parts: Mapping[str, list[Part]], state: State, folds: xr.DataArray) -> list[str]:
+def without_slopes(passing: list[str], parts: Mapping[str, list[Component]], state: State, folds: xr.DataArray) -> list[str]:
     """Keys without lines that are gone, or nearly so, when the spectrum is straightened by a filter that passes as well.
 
     A line is judged by its neighbours, so that the steep slope of a filter, or the lobes of an average, look like one. Lines that
@@ -39,15 +39,15 @@ def without_slopes(passing: list[str], parts: Mapping[str, list[Part]], state: S
     filters = [key for key in passing if any(is_filter(part.candidate.view, part.variant) for part in parts[key])]
     if not lines or not filters:
         return passing
-    trial = explain_away(state, list(parts[filters[0]]))
-    again = gains(_candidates(parts, lines), trial.reduced, trial, folds)
+    trial = condition_on(state, list(parts[filters[0]]))
+    again = compute_evidence(_candidates(parts, lines), trial.reduced, trial, folds)
     left = {one.candidate.key: float(np.maximum(one.gain[0], 0.0).sum()) for one in again}
     before = {key: sum(max(part.gain, 0.0) for part in parts[key]) for key in lines}
     real = {key for key in lines if left.get(key, 0.0) > _KEPT * before[key]}
     return [key for key in passing if (key in real if key in lines else key not in filters or not real)]
 
 
-def on_all_axes(parts: Sequence[Part], state: State) -> bool:
+def on_all_axes(parts: Sequence[Component], state: State) -> bool:
     """Whether one filter suits all axes: they pass the same logger, so that it takes the same share of the noise of each.
 
     The share of the strongest part is fitted on every axis, also on those that do not show it, and once for all of them.
@@ -56,17 +56,17 @@ def on_all_axes(parts: Sequence[Part], state: State) -> bool:
     if not shown:
         return True
     first = max(shown, key=lambda part: part.gain)
-    share, error = np.array([part_size(replace(first, row=(axis,)), state) for axis in state.axes]).T
+    share, error = np.array([component_size(replace(first, row=(axis,)), state) for axis in state.axes]).T
     weight = error**-2.0
     apart = 0.5 * float((weight * (share - (weight * share).sum() / weight.sum()) ** 2).sum())
     return apart <= _APART + _FORM * sum(max(part.gain, 0.0) for part in shown)
 
 
-def _candidates(parts: Mapping[str, list[Part]], keys: Iterable[str]) -> list[Candidate]:
+def _candidates(parts: Mapping[str, list[Component]], keys: Iterable[str]) -> list[Candidate]:
     return [parts[key][0].candidate for key in keys]
 
 
-def filter_sizes(parts: Sequence[Part], state: State) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
+def filter_sizes(parts: Sequence[Component], state: State) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
     """Cutoff or length of a filter, and the words beside it, by the likelihood of the powers of all its axes with free noise.
 
     Returns

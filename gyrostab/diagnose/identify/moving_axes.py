@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.identification import Claim
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.progress import Stage, no_stage
@@ -92,7 +92,7 @@ def _core(mean: Array) -> tuple[float, float]:
     return float(np.median(ordered[first : first + size])), float(width[first]) / _CORE_WIDTH
 
 
-def unexplained_motion(reduced: xr.Dataset, claims: Iterable[Claim]) -> NDArray[np.bool_]:
+def unexplained_motion(reduced: xr.Dataset, claims: Iterable[Identification]) -> NDArray[np.bool_]:
     """Moving blocks, (axis, block), of the axes on which no named effect accounts for the means.
 
     What stands for a mean must leave next to nothing of the motion. It is not enough that it brings something: of a turning that comes

@@ -9,16 +9,16 @@ from itertools import pairwise
 
 from gyrostab.diagnose.identify.components import by_key, tried_again
 from gyrostab.diagnose.predict.candidates import Candidate
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Found
 
 __all__ = ["found_again", "layers"]
 
 
-def layers(parts: Sequence[Part]) -> list[list[Part]]:
+def layers(parts: Sequence[Component]) -> list[list[Component]]:
     """Parts by how often their view, row and witness have come before."""
-    out: list[list[Part]] = []
+    out: list[list[Component]] = []
     seen: Counter[tuple[object, ...]] = Counter()
     for part in parts:
         place = part.candidate.view, part.row, part.candidate.witness
@@ -30,8 +30,8 @@ def layers(parts: Sequence[Part]) -> list[list[Part]]:
 
 
 def found_again(
-    parts: Sequence[Part], first: Sequence[Part], state: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
-) -> list[list[Part]]:
+    parts: Sequence[Component], first: Sequence[Component], state: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
+) -> list[list[Component]]:
     """For each layer of a claim what is found of it anew with the layers before it in the model.
 
     What several variants explain together is no gain of one of them: the first of two opposite jumps explains little alone.
@@ -51,7 +51,7 @@ def found_again(
     weight, key = state.weight, parts[0].candidate.key
     axes = {axis for part in parts for axis in part.row}
     for before, layer in pairwise(layers(parts)):
-        state = replace(explain_away(state, before), weight=weight)
+        state = replace(condition_on(state, before), weight=weight)
         again = by_key(gains(tried_again(layer), state)).get(key, [])
         out.append([part for part in again if set(part.row) & axes])
     return out

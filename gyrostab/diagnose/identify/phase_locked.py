@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from gyrostab.diagnose.identify.identification import Naming
+from gyrostab.diagnose.identify.identification import Identifications
 
 __all__ = ["without_waves"]
 
 _VIEWS = ("order", "phase_locked")
 
 
-def without_waves(naming: Naming) -> tuple[Naming, float]:
+def without_waves(naming: Identifications) -> tuple[Identifications, float]:
     """The naming without what is locked to rotation or ramp, and what that gains on time that was kept apart [nats].
 
     The powers of the bands know how large a wave is, but not its phase: with a wave in them they gain a small part of what the wave is

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.predict.search import Tallies
+from gyrostab.diagnose.predict.search import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
 
-__all__ = ["line_size", "mark_sizes"]
+__all__ = ["line_size", "sample_count_sizes"]
 
 _DEPARTURE = 1.08  # of white noise from the median of eight samples beside each, in its own deviations
 _USUAL = 0.2  # of the usual variance of a block, by which that of one may be higher by chance
@@ -40,7 +40,7 @@ def line_size(reduced: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
     return (amplitude, noise / (2.0 * max(amplitude, math.sqrt(noise)))), (frequency, 0.5 * step)
 
 
-def mark_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: Tallies) -> dict[str, Pair]:
+def sample_count_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: CountEvidence) -> dict[str, Pair]:
     """Parameters of an effect on the distribution."""
     from scipy.stats import norm
 

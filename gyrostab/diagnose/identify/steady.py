@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 
-__all__ = ["always_there"]
+__all__ = ["is_always_present"]
 
 _STEADY = ("gauss_markov", "telegraph", "logger_filter")
 _PARTS, _LEAST = 8, 3  # of the record that are looked at one by one; blocks in each at least
 _APART, _FORM = 8.0, 0.1  # nats by which they may differ by chance; and of the gain, what other effects may leave
 
 
-def always_there(part: Part, state: State) -> bool:
+def is_always_present(part: Component, state: State) -> bool:
     """Whether a part that has no course in time has the same size in all eighths of the record; true for what may come and go.
 
     What is loud while the tool turns, or for any other while, has a broad spectrum too, and is no filter and no wandering bias.
@@ -31,7 +31,7 @@ def always_there(part: Part, state: State) -> bool:
     """
     if part.candidate.effect not in _STEADY or part.candidate.view != "power" or state.reduced.sizes["block"] < _PARTS * _LEAST:
         return True
-    state = replace(state, weight=explain_away(state, [part]).weight)
+    state = replace(state, weight=condition_on(state, [part]).weight)
     size, error = np.array([_size(part, state, inside) for inside in np.array_split(np.arange(state.reduced.sizes["block"]), _PARTS)]).T
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0
     size = np.where(weight > 0.0, size, 0.0)
@@ -39,7 +39,7 @@ def always_there(part: Part, state: State) -> bool:
     return apart <= _APART + _FORM * max(part.gain, 0.0)
 
 
-def _size(part: Part, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:
+def _size(part: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:
     """Size of the first column by some blocks alone, and its error."""
     outside = np.ones(state.masked.shape[1], np.bool_)
     outside[inside] = False
@@ -47,5 +47,5 @@ def _size(part: Part, state: State, inside: NDArray[np.int64]) -> tuple[float, f
     power = state.reduced["power"].isel(axis=row).values
     if not (np.isfinite(power).any(axis=1) & ~state.masked[row] & ~outside).any():
         return 0.0, np.inf
-    mean, covariance = part_mixture(part, replace(state, masked=state.masked | outside)).moments()
+    mean, covariance = component_mixture(part, replace(state, masked=state.masked | outside)).moments()
     return float(mean[0]), float(np.sqrt(covariance[0, 0]))

@@ -11,20 +11,20 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.candidates import Candidate, Variant, variants_of
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.search import compute_evidence
 
-__all__ = ["SLIDES", "beats_slides"]
+__all__ = ["TIME_SHIFTS", "passes_time_shift_test"]
 
 #: Copies of the channel at most.
-SLIDES = 200
+TIME_SHIFTS = 200
 _ALIKE = 0.5  # correlation from which on a slid design is too much like the true one
 _FEWEST = 20
 _OF_AXES = ("misalignment",)  # effects that follow the means of other axes
 
 
-def beats_slides(parts: Sequence[Part], state: State, folds: xr.DataArray, *, share: float = 0.01) -> tuple[bool, float]:
+def passes_time_shift_test(parts: Sequence[Component], state: State, folds: xr.DataArray, *, share: float = 0.01) -> tuple[bool, float]:
     """Whether an effect explains more than almost all slid copies of its channel do.
 
     Parameters
@@ -49,7 +49,7 @@ def beats_slides(parts: Sequence[Part], state: State, folds: xr.DataArray, *, sh
     if not own:
         return True, np.nan
     blocks = state.reduced.sizes["block"]
-    shifts = np.unique(np.linspace(blocks * 0.05, blocks * 0.95, SLIDES).astype(int))
+    shifts = np.unique(np.linspace(blocks * 0.05, blocks * 0.95, TIME_SHIFTS).astype(int))
     real, slid = 0.0, np.zeros(shifts.size)
     valid = np.ones(shifts.size, np.bool_)
     for part in own:
@@ -60,7 +60,7 @@ def beats_slides(parts: Sequence[Part], state: State, folds: xr.DataArray, *, sh
                 valid[number] = False
         chosen = [copy if copy is not None else part.variant for copy in copies]
         several = [replace(part.candidate, effect=f"slid {number}", variants=(one,)) for number, one in enumerate(chosen)]
-        found = gains([replace(part.candidate, variants=(part.variant,)), *several], state.reduced, state, folds)
+        found = compute_evidence([replace(part.candidate, variants=(part.variant,)), *several], state.reduced, state, folds)
         values = np.array([one.gain[0, row] for one in found])
         real += float(values[0])
         slid += values[1:]
@@ -70,14 +70,14 @@ def beats_slides(parts: Sequence[Part], state: State, folds: xr.DataArray, *, sh
     return p_value <= share, p_value
 
 
-def _follows(part: Part, state: State) -> bool:
+def _follows(part: Component, state: State) -> bool:
     """Whether a part follows a channel in means or powers, or the means of other axes."""
     if part.candidate.view not in ("mean", "power"):
         return False
     return any(part.candidate.driver) or (part.candidate.view == "mean" and part.candidate.effect in _OF_AXES)
 
 
-def _slid(part: Part, state: State, shift: int) -> Variant | None:
+def _slid(part: Component, state: State, shift: int) -> Variant | None:
     """The variant with its channels slid around the record."""
     candidate: Candidate = part.candidate
     reduced = state.reduced.copy()

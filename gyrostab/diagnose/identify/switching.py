@@ -7,22 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from gyrostab.diagnose.evidence.telegraph import level_gains
-from gyrostab.diagnose.identify.components import axes_of, gain_of
-from gyrostab.diagnose.identify.identification import Claim, Naming, Unknown
+from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
+from gyrostab.diagnose.identify.components import axes_of, evidence_of
+from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.jumps import jumps_at_will
-from gyrostab.diagnose.predict.condition import Part, mean_columns
+from gyrostab.diagnose.predict.condition import Component, mean_columns
 from gyrostab.diagnose.predict.designs import Candidate
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Found
 
-__all__ = ["followed_first", "hopping", "hops_alone", "renewed", "without_levels"]
+__all__ = ["followed_first", "hops_alone", "identify_switching", "remove_telegraph_bias", "renewed"]
 
 _VIEW = "levels"
 _LED = 0.5  # of the variance of a course of hops, from which on a channel that explains it may be their cause
 
 
-def followed_first(passing: list[str], parts: Mapping[str, Sequence[Part]], state: State) -> list[str]:
+def followed_first(passing: list[str], parts: Mapping[str, Sequence[Component]], state: State) -> list[str]:
     """Keys without those of two levels, as long as a mean that follows a channel passes too and may be why they hop.
 
     A channel that switches makes two levels as well, and what its mean leaves, since its form is not exact, hops where it hops. So the
@@ -32,12 +32,12 @@ def followed_first(passing: list[str], parts: Mapping[str, Sequence[Part]], stat
     return [key for key in passing if not any(_may_be_led(part, led, state) for part in parts[key])]
 
 
-def _may_be_led(part: Part, led: Sequence[Part], state: State) -> bool:
+def _may_be_led(part: Component, led: Sequence[Component], state: State) -> bool:
     beside = [one for one in led if part.candidate.view == _VIEW and one.row == part.row]
     return any(one.gain >= part.gain or _share_of(part, one, state) > _LED for one in beside)
 
 
-def _share_of(part: Part, other: Part, state: State) -> float:
+def _share_of(part: Component, other: Component, state: State) -> float:
     """Share of the variance of the first column of a part that the columns of another one on the same axis explain."""
     row = state.axes.index(part.row[0])
     course, beside = mean_columns(part.variant, row)[0], np.stack(mean_columns(other.variant, row), axis=1)
@@ -47,7 +47,7 @@ def _share_of(part: Part, other: Part, state: State) -> float:
     return float(1.0 - np.square(course - beside @ size).sum() / max(float(np.square(course).sum()), 1e-300))
 
 
-def hopping(passing: list[str], parts: Mapping[str, Sequence[Part]], state: State) -> list[str]:
+def identify_switching(passing: list[str], parts: Mapping[str, Sequence[Component]], state: State) -> list[str]:
     """Keys of biases that hop within blocks, unless a mean that follows a channel may be why; once on an axis.
 
     What hops beside hops that are named is no reason for powers and tails that these have not taken yet, and may be a jump.
@@ -60,11 +60,11 @@ def hopping(passing: list[str], parts: Mapping[str, Sequence[Part]], state: Stat
 
 
 def hops_alone(
-    chosen: Sequence[Claim | Unknown],
-    state_with: Callable[[Sequence[Claim | Unknown]], State],
+    chosen: Sequence[Identification | Unidentified],
+    state_with: Callable[[Sequence[Identification | Unidentified]], State],
     gains: Callable[[Sequence[Candidate], State], list[Found]],
     threshold: float,
-) -> list[Claim | Unknown]:
+) -> list[Identification | Unidentified]:
     """What is chosen, without jumps on the axis of hops that the hops explain as well when they are sought without them.
 
     The first and the last of few hops are jumps too, of the same step, and the hops that are found beside these lack them.
@@ -95,26 +95,26 @@ def hops_alone(
     return out
 
 
-def _of_blocks(part: Part, state: State) -> float:
+def _of_blocks(part: Component, state: State) -> float:
     """What two levels gain in the means of blocks [nats], which can be compared: those of pieces know more, and are not always there."""
     given = state.given.get(("mean", part.row[0]))
-    gain, _ = level_gains(state.reduced, state.baseline, axis=part.row[0], given=np.stack(given, axis=-1) if given else None)
+    gain, _ = telegraph_evidence(state.reduced, state.baseline, axis=part.row[0], given=np.stack(given, axis=-1) if given else None)
     return float(gain[0])
 
 
-def _holds(chosen: Sequence[Claim | Unknown], parts: Sequence[Part]) -> bool:
+def _holds(chosen: Sequence[Identification | Unidentified], parts: Sequence[Component]) -> bool:
     return all(any(part is own for one in chosen for own in one.parts) for part in parts)
 
 
-def _with_part(claim: Claim | Unknown, part: Part, instead: Part) -> Claim | Unknown:
+def _with_part(claim: Identification | Unidentified, part: Component, instead: Component) -> Identification | Unidentified:
     return replace(claim, parts=tuple(instead if own is part else own for own in claim.parts))
 
 
-def _jumps_beside(part: Part, chosen: Sequence[Claim | Unknown], state: State) -> list[Part]:
+def _jumps_beside(part: Component, chosen: Sequence[Identification | Unidentified], state: State) -> list[Component]:
     return [one for claim in chosen for one in claim.parts if one.row == part.row and jumps_at_will(one, state)]
 
 
-def _without(chosen: Sequence[Claim | Unknown], left_out: Sequence[Part]) -> list[Claim | Unknown]:
+def _without(chosen: Sequence[Identification | Unidentified], left_out: Sequence[Component]) -> list[Identification | Unidentified]:
     """What is chosen without some of its parts; claims of which nothing is left are none."""
     out = []
     for one in chosen:
@@ -128,22 +128,22 @@ def _without(chosen: Sequence[Claim | Unknown], left_out: Sequence[Part]) -> lis
     return out
 
 
-def _sought(part: Part, found: Sequence[Found]) -> Part:
+def _sought(part: Component, found: Sequence[Found]) -> Component:
     """The part as it was found anew."""
     (one,) = found
     row = one.rows.index(part.row)
     return replace(part, variant=one.best[row], gain=float(one.gain[0, row]))
 
 
-def renewed(parts: Sequence[Part], part: Part) -> Part:
+def renewed(parts: Sequence[Component], part: Component) -> Component:
     """A part with its gain among `parts`, which were found with all others in the model; and with the course that was found then."""
-    fresh = replace(part, gain=gain_of(parts, part))
+    fresh = replace(part, gain=evidence_of(parts, part))
     if part.candidate.view != _VIEW:
         return fresh
     return next((replace(fresh, variant=one.variant) for one in parts if (one.candidate.view, one.row) == (_VIEW, part.row)), fresh)
 
 
-def without_levels(naming: Naming) -> tuple[Naming, float]:
+def remove_telegraph_bias(naming: Identifications) -> tuple[Identifications, float]:
     """The naming without biases of two levels, whose course no other time tells; and what these gain [nats]."""
     those = [claim for claim in naming.claims if any(part.candidate.view == _VIEW for part in claim.parts)]
     kept = tuple(claim for claim in naming.claims if claim not in those)

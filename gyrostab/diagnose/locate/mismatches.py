@@ -9,14 +9,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.locate.regions import merged, wandering
+from gyrostab.diagnose.locate.regions import merge_regions, merge_wandering_regions
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores, standardise
-from gyrostab.diagnose.statistics import VIEWS
-from gyrostab.diagnose.statistics.mean import box_mean
+from gyrostab.diagnose.statistics import STATISTICS
+from gyrostab.diagnose.statistics.mean import region_mean
 from gyrostab.diagnose.statistics.variance_stability import levelled
 from gyrostab.errors import OptionError
 
-__all__ = ["FIELDS", "locate", "louder"]
+__all__ = ["FIELDS", "locate_mismatches", "louder"]
 
 Array = NDArray[np.float64]
 _RAISED = 2.0  # of a piece that has a part in a mismatch
@@ -44,7 +44,9 @@ FIELDS = {
 }
 
 
-def locate(reduced: xr.Dataset, baseline: xr.Dataset, nulls: Iterable[xr.Dataset] | NullScores, *, level: float = 0.01) -> xr.Dataset:
+def locate_mismatches(
+    reduced: xr.Dataset, baseline: xr.Dataset, nulls: Iterable[xr.Dataset] | NullScores, *, level: float = 0.01
+) -> xr.Dataset:
     """Find where a recording differs from the simulation by more than noise does.
 
     Every view scores its cells; a score counts in standard deviations of the null records, and its p-value is the share of null
@@ -85,13 +87,13 @@ def locate(reduced: xr.Dataset, baseline: xr.Dataset, nulls: Iterable[xr.Dataset
         raise OptionError(f"level {level!r}: give the share of false alarms, above 0 and below 0.5, for instance 0.01")
     null = nulls if isinstance(nulls, NullScores) else null_scores(baseline, nulls)
     boxes: list[dict[str, Any]] = []
-    for name, score in VIEWS.items():
+    for name, score in STATISTICS.items():
         if name not in null.views:
             continue
         find = _mean_boxes if name == "mean" else _boxes
         seen = levelled(reduced, baseline, louder(boxes)) if name == "restless" else reduced
         boxes += find(name, score, seen, baseline, null, level)
-    return _table(merged(boxes)[:_TOLD], reduced, null, level)
+    return _table(merge_regions(boxes)[:_TOLD], reduced, null, level)
 
 
 def louder(boxes: Iterable[Mapping[str, Any]]) -> list[tuple[list[str], float, float]]:
@@ -131,12 +133,12 @@ def _mean_boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset
                 continue
             box["p_value"] = float(null.p_value(name, box["z"]))
             inside = (reduced["begin"].values >= box["begin"] - 1e-9) & (reduced["end"].values <= box["end"] + 1e-9)
-            box |= {"estimate": box_mean(reduced, now, row, inside), "tau_max_s": max(box["end"] - box["begin"], box["tau_min_s"])}
+            box |= {"estimate": region_mean(reduced, now, row, inside), "tau_max_s": max(box["end"] - box["begin"], box["tau_min_s"])}
             known.values[row] += np.where(inside, box["estimate"], 0.0)
             found.append(box)
         if not open_rows:
             break
-    return wandering(found)
+    return merge_wandering_regions(found)
 
 
 def _next_box(scores: xr.Dataset, row: int, left: Array, z: Array, critical: float) -> dict[str, Any] | None:

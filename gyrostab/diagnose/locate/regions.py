@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["merged", "wandering"]
+__all__ = ["merge_regions", "merge_wandering_regions"]
 
-Box = dict[str, Any]
+Region = dict[str, Any]
 _LIKE = 0.5  # share of the time of both that two boxes have in common when they are one
 _NEAR = 0.25  # of the longer of two boxes, which may lie between them when they are one, if it is no longer than the shorter
 _LINE = 0.02  # share of the frequency by which one line may wander
@@ -15,7 +15,7 @@ _KINDS = ("slow", "restless", "glide")
 _STEPS = 3  # boxes of one mean, beyond which it is said to wander
 
 
-def merged(boxes: Sequence[Box]) -> list[Box]:
+def merge_regions(boxes: Sequence[Region]) -> list[Region]:
     """Join boxes, the surest first; the surest of those that are joined gives its numbers.
 
     Boxes of different axes are one when they share most of their time; those of the same axes also when they lie side by side, and
@@ -33,7 +33,7 @@ def merged(boxes: Sequence[Box]) -> list[Box]:
     >>> [(one["axes"], one["end"]) for one in merged([box, box | {"axes": "y", "z": 8.0}, box | {"begin": 60.0, "end": 90.0, "z": 7.0}])]
     [('x y', 90.0)]
     """
-    kept: list[Box] = []
+    kept: list[Region] = []
     for box in sorted(boxes, key=lambda one: (one["p_value"], -abs(one["z"]))):
         for other in kept:
             if not _alike(box, other):
@@ -46,7 +46,7 @@ def merged(boxes: Sequence[Box]) -> list[Box]:
     return kept
 
 
-def _alike(one: Box, other: Box) -> bool:
+def _alike(one: Region, other: Region) -> bool:
     """The same view, direction, and averaging times or line."""
     if one["view"] != other["view"] or (one["sign"] != other["sign"] and one["view"] != "cross_axis"):
         return False
@@ -57,18 +57,18 @@ def _alike(one: Box, other: Box) -> bool:
     return bool(min(one["tau_max_s"], other["tau_max_s"]) >= 0.99 * max(one["tau_min_s"], other["tau_min_s"]))
 
 
-def _kind(box: Box) -> str:
+def _kind(box: Region) -> str:
     """What is never one mismatch: inside of blocks and from one to the next, a level and its scatter, lines that stand and that move."""
     kind = str(box["what"]).split(" ")[0]
     return kind if kind in _KINDS else ""
 
 
-def _shared(one: Box, other: Box) -> float:
+def _shared(one: Region, other: Region) -> float:
     common = min(one["end"], other["end"]) - max(one["begin"], other["begin"])
     return float(common / (max(one["end"], other["end"]) - min(one["begin"], other["begin"])))
 
 
-def _touching(one: Box, other: Box) -> bool:
+def _touching(one: Region, other: Region) -> bool:
     """Pieces of the same axes that lie side by side."""
     if not set(one["axes"].split()) <= set(other["axes"].split()) or one["view"] in ("mean", "restart"):
         return False
@@ -76,7 +76,7 @@ def _touching(one: Box, other: Box) -> bool:
     return bool(max(one["begin"], other["begin"]) - min(one["end"], other["end"]) <= min(_NEAR * longer, shorter) + 1e-6)
 
 
-def _join(box: Box, other: Box) -> None:
+def _join(box: Region, other: Region) -> None:
     if _shared(box, other) <= _LIKE:
         box["begin"], box["end"] = min(box["begin"], other["begin"]), max(box["end"], other["end"])
         if box["what"] != "line":
@@ -86,7 +86,7 @@ def _join(box: Box, other: Box) -> None:
     box["axes"] = " ".join([*names, *(name for name in other["axes"].split() if name not in names)])
 
 
-def wandering(boxes: Sequence[Box]) -> list[Box]:
+def merge_wandering_regions(boxes: Sequence[Region]) -> list[Region]:
     """Boxes of the mean, those of an axis as one when there are many: its mean wanders, and the largest gives the numbers.
 
     Parameters

@@ -9,10 +9,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.statistics import VIEWS
+from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.errors import OptionError
 
-__all__ = ["NullScores", "Tail", "ViewNull", "null_scores", "standardise"]
+__all__ = ["NullScores", "StatisticNull", "Tail", "null_scores", "standardise"]
 
 Array = NDArray[np.float64]
 _BELOW = 1.4  # standard deviations below the largest of independent cells, from which on scores are kept
@@ -47,7 +47,7 @@ class Tail:
 
 
 @dataclass(frozen=True)
-class ViewNull:
+class StatisticNull:
     """One view in the null records: moments of each cell, and the tail of half the square of the largest standardised score."""
 
     mean: Array
@@ -62,14 +62,14 @@ class NullScores:
     Attributes
     ----------
     views : mapping of str to ViewNull
-        By the names of `gyrostab.diagnose.statistics.VIEWS`.
+        By the names of `gyrostab.diagnose.statistics.STATISTICS`.
     family : Tail
         Of the largest ``-log p`` over the views, p that of each view's largest score.
     records : int
         Null records.
     """
 
-    views: Mapping[str, ViewNull]
+    views: Mapping[str, StatisticNull]
     family: Tail
     records: int
 
@@ -110,7 +110,7 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
         size = max(1, _AT_ONCE * chunk.sizes["record"] // chunk["power"].size)
         for first in range(0, chunk.sizes["record"], size):
             part = chunk.isel(record=slice(first, first + size))
-            for name, score in VIEWS.items():
+            for name, score in STATISTICS.items():
                 found = score(part, baseline)
                 if found is not None:
                     if name not in gathered:
@@ -123,12 +123,12 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
     for name, view in gathered.items():
         mean, spread, z = view.finish()
         half = z**2 / 2.0
-        views[name] = ViewNull(mean, spread, _tail(half))
+        views[name] = StatisticNull(mean, spread, _tail(half))
         largest[name] = views[name].tail.surprise(half)
     return NullScores(views, _tail(np.max(list(largest.values()), axis=0)), records)
 
 
-def standardise(scores: xr.Dataset, null: ViewNull) -> Array:
+def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:
     """Scores in standard deviations of the null records, below zero where one-sided."""
     z = (scores["z"].values - null.mean) / null.spread
     return np.asarray(np.maximum(z, 0.0) if scores.attrs["one_sided"] else z)

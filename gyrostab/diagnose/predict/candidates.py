@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.sample_counts import OF_LATTICE, coarse_lattice
+from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, has_coarse_grid
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
 from gyrostab.diagnose.predict.designs import BUILDERS, Candidate, Variant, term_density
 from gyrostab.diagnose.predict.step_times import known_instants, tried_instants
@@ -24,7 +24,7 @@ from gyrostab.physics.registry import effects
 
 __all__ = [
     "LARGEST",
-    "VIEWS",
+    "STATISTIC_NAMES",
     "Candidate",
     "Variant",
     "channel_units",
@@ -36,7 +36,7 @@ __all__ = [
 
 Array = NDArray[Any]
 #: Where an effect can show, in the order in which they are looked at.
-VIEWS = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander", "levels")
+STATISTIC_NAMES = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander", "levels")
 _MOST_VALUES, _MOST_VARIANTS = 60, 200
 #: Effect -> largest size that is plausible, of each of its parameters.
 LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
@@ -157,10 +157,10 @@ def effect_candidates(reduced: xr.Dataset, coefficient: xr.DataArray) -> tuple[l
 
 def _by_lattice(kind: type[Effect], reduced: xr.Dataset) -> bool:
     """The effect is told by statistics that, on every axis of this record, are those of the lattice of values."""
-    if kind.channels or not coarse_lattice(reduced).all():
+    if kind.channels or not has_coarse_grid(reduced).all():
         return False
     marks = kind.example().explain(windows_of(reduced, {})).marks
-    return bool(marks) and set(marks) <= set(OF_LATTICE)
+    return bool(marks) and set(marks) <= set(GRID_COUNTS)
 
 
 # ------------------------------------------------------------------------------------------------------------- channels

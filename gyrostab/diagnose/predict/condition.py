@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.fast_switching import hop_powers
+from gyrostab.diagnose.evidence.fast_switching import switching_powers
 from gyrostab.diagnose.evidence.held_out import noise_columns
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_skirt
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
@@ -22,23 +22,23 @@ from gyrostab.diagnose.predict.linear_model import (
     order_columns,
     pair_rows,
     power_column,
-    witness_power,
+    reference_channel_power,
 )
 from gyrostab.physics.phase import fold
 
 __all__ = [
     "FLOOR",
-    "Part",
-    "explain_away",
+    "Component",
+    "add_fast_switching",
+    "condition_on",
+    "condition_on_component",
+    "condition_on_components",
+    "find_anomalous_blocks",
+    "mask_anomalous_blocks",
     "mean_columns",
     "mirrored",
-    "odd_blocks",
     "power_shares",
     "reweighted",
-    "take_part",
-    "take_parts",
-    "with_hops",
-    "without_odd",
     "without_turns",
 ]
 
@@ -55,7 +55,7 @@ _TURN = 0.2  # change of the logarithm of the noise power from block to block
 
 
 @dataclass(frozen=True)
-class Part:
+class Component:
     """One row of a view in which a named effect shows.
 
     Attributes
@@ -77,24 +77,24 @@ class Part:
     place: int = -1
 
 
-def mirrored(part: Part) -> bool:
+def mirrored(part: Component) -> bool:
     """Whether the axes see what turns in the other order: y stands at -90 degrees from x, or the channel runs back."""
     return part.candidate.view == "order" and not part.candidate.each and part.place % 2 == 1
 
 
-def explain_away(state: State, parts: list[Part]) -> State:
+def condition_on(state: State, parts: list[Component]) -> State:
     """The state with an effect in it."""
-    return reweighted(take_parts(state, parts))
+    return reweighted(condition_on_components(state, parts))
 
 
-def take_parts(state: State, parts: Iterable[Part]) -> State:
+def condition_on_components(state: State, parts: Iterable[Component]) -> State:
     """The state with rows of effects in it, before its powers are fitted anew."""
     for part in parts:
-        state = take_part(state, part)
+        state = condition_on_component(state, part)
     return state
 
 
-def take_part(state: State, part: Part) -> State:
+def condition_on_component(state: State, part: Component) -> State:
     """The state with one row of an effect in it."""
     return _TAKERS[part.candidate.view](state, part)
 
@@ -104,7 +104,7 @@ def mean_columns(variant: Variant, row: int) -> list[Array]:
     return [np.asarray(one[row] if one.shape[0] > 1 else one[0]) for one in variant.design]
 
 
-def _mean(state: State, part: Part) -> State:
+def _mean(state: State, part: Component) -> State:
     axis = part.row[0]
     row = state.axes.index(axis)
     columns = mean_columns(part.variant, row)
@@ -112,7 +112,7 @@ def _mean(state: State, part: Part) -> State:
     return replace(state, masked=state.masked | _edges(state, row, columns))
 
 
-def _hopping(state: State, part: Part) -> State:
+def _hopping(state: State, part: Component) -> State:
     """A bias of two levels; where it hops within blocks its course is the power there, and their kurtosis says nothing."""
     inside = part.variant.inside
     if not inside.size:
@@ -121,15 +121,15 @@ def _hopping(state: State, part: Part) -> State:
     row = state.axes.index(axis)
     attrs = state.reduced.attrs
     low, high = (float(part.variant.values[name]) for name in ("low", "high"))
-    power = hop_powers(inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"]))
-    state = with_hops(state, part)
+    power = switching_powers(inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"]))
+    state = add_fast_switching(state, part)
     state = state.with_columns("power", axis, [power_column(power[None], row, state)])
     moves = xr.DataArray(np.ptp(inside, axis=1) > _HOPS, dims="block") & (state.reduced["axis"] == axis)
     blank = {name: state.reduced[name].where(~moves, other) for name, other in (("kurtosis", np.nan), ("outliers", 0))}
     return replace(state, reduced=state.reduced.assign(blank))
 
 
-def with_hops(state: State, part: Part) -> State:
+def add_fast_switching(state: State, part: Component) -> State:
     """The state with the course of a bias that hops within blocks, in the means of blocks and of their pieces."""
     axis = part.row[0]
     return state.with_columns("mean", axis, mean_columns(part.variant, 0)).with_columns("inner", axis, [part.variant.inside])
@@ -155,7 +155,7 @@ def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
     return mask
 
 
-def _power(state: State, part: Part) -> State:
+def _power(state: State, part: Component) -> State:
     axis = part.row[0]
     row = state.axes.index(axis)
     if is_filter("power", part.variant) and "line_power" in state.reduced:
@@ -167,7 +167,7 @@ def _power(state: State, part: Part) -> State:
     return state.with_columns("power", axis, [power_column(one, row, state) for one in part.variant.design])
 
 
-def _cross(state: State, part: Part) -> State:
+def _cross(state: State, part: Component) -> State:
     row = pair_rows(state.reduced).index(part.row)
     columns = []
     for one in part.variant.design:
@@ -209,7 +209,7 @@ def _bands_of(state: State, frequency: Array) -> NDArray[np.bool_]:
     return (place >= low - reach) & (place < high + reach)
 
 
-def _order(state: State, part: Part) -> State:
+def _order(state: State, part: Component) -> State:
     count = state.reduced.sizes["harmonic"]
     turn = np.abs(state.reduced["channel_rotation_rate"].values) / 360.0
     if part.candidate.each:
@@ -240,7 +240,7 @@ def _free_shape(state: State, axis: str) -> State:
     return state.with_columns("power", axis, [np.broadcast_to(one, state.weight.shape[1:]) for one in np.eye(bands)])
 
 
-def _profile(state: State, part: Part) -> State:
+def _profile(state: State, part: Component) -> State:
     state = state.with_columns("phase_locked", part.row[0], list(part.variant.design))
     if "ramp_turns" in state.reduced:
         state = state.with_columns("line", "all", [_comb(state)])
@@ -261,9 +261,9 @@ def _comb(state: State) -> NDArray[np.bool_]:
     return np.asarray(near.any(axis=1))
 
 
-def _transfer(state: State, part: Part) -> State:
+def _transfer(state: State, part: Component) -> State:
     axis = part.row[0]
-    power = witness_power(part.candidate.witness[0], state.reduced)
+    power = reference_channel_power(part.candidate.witness[0], state.reduced)
     power = np.where(np.isfinite(power), power, 0.0)
     columns = np.concatenate(
         [part.variant.design.real * np.sqrt(power)[:, None], part.variant.design.imag * np.sqrt(power)[:, None]], axis=-1
@@ -278,7 +278,7 @@ def _transfer(state: State, part: Part) -> State:
     return state
 
 
-def _line(state: State, part: Part) -> State:
+def _line(state: State, part: Component) -> State:
     frequency = float(state.reduced["line_frequency"].values[part.place])
     axis = part.row[0]
     density = _bands_of(state, np.asarray(frequency)).astype(float)
@@ -293,11 +293,11 @@ def _line(state: State, part: Part) -> State:
     return state.with_columns("line", "all", [line_skirt(state.reduced, axis, part.place)])
 
 
-def _marks(state: State, part: Part) -> State:
+def _marks(state: State, part: Component) -> State:
     """Blocks with odd samples say nothing of the rest; where there are too many of them, the shape of the spectrum does not."""
     if _everywhere(part):
         return state
-    axis, odd = part.row[0], odd_blocks(part, state.reduced)
+    axis, odd = part.row[0], find_anomalous_blocks(part, state.reduced)
     if not odd.any():
         return _free_shape(state, axis)
     keep = xr.DataArray(~odd, dims="block")
@@ -311,12 +311,12 @@ def _marks(state: State, part: Part) -> State:
     return replace(state, reduced=reduced)
 
 
-def _everywhere(part: Part) -> bool:
+def _everywhere(part: Component) -> bool:
     """Odd samples that are in every block alike, so that none says less of the rest than others."""
     return part.candidate.effect == "rate_quantization" or part.candidate.effect.startswith("~")
 
 
-def odd_blocks(part: Part, reduced: xr.Dataset) -> NDArray[np.bool_]:
+def find_anomalous_blocks(part: Component, reduced: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks with odd samples, which are left out on the axis; none where they would be too many, or the effect is in all alike."""
     samples = reduced["samples"].sel(axis=part.row[0]).values
     there = samples > _THERE * samples.max(initial=0)
@@ -328,12 +328,12 @@ def odd_blocks(part: Part, reduced: xr.Dataset) -> NDArray[np.bool_]:
     return np.asarray(odd & (odd[there].mean() <= _ODD))
 
 
-def without_odd(reduced: xr.Dataset, parts: Iterable[Part]) -> xr.Dataset:
+def mask_anomalous_blocks(reduced: xr.Dataset, parts: Iterable[Component]) -> xr.Dataset:
     """The record without the blocks of odd samples that are named: their counts tell what they gain, their powers have no model."""
     axes = [str(axis) for axis in reduced["axis"].values]
     odd = np.zeros((len(axes), reduced.sizes["block"]), np.bool_)
     for part in (part for part in parts if part.candidate.view == "marks"):
-        odd[axes.index(part.row[0])] |= odd_blocks(part, reduced)
+        odd[axes.index(part.row[0])] |= find_anomalous_blocks(part, reduced)
     if not odd.any():
         return reduced
     there = xr.DataArray(~odd, dims=("axis", "block"))

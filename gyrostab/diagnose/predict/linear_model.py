@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.held_out import Cells, independent, noise_columns
+from gyrostab.diagnose.evidence.held_out import LinearModel, independent, noise_columns
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.reduce.block_statistics import measured, noise_at_orders
 from gyrostab.kernels.spectra.periodogram import taper
@@ -23,7 +23,7 @@ from gyrostab.kernels.spectra.periodogram import taper
 __all__ = [
     "State",
     "begin_state",
-    "cells_of",
+    "build_linear_model",
     "cross_column",
     "cross_without",
     "drawn",
@@ -31,8 +31,8 @@ __all__ = [
     "in_place",
     "known_cross",
     "pair_rows",
-    "view_rows",
-    "witness_power",
+    "reference_channel_power",
+    "statistic_rows",
 ]
 
 Array = NDArray[Any]
@@ -84,7 +84,7 @@ def begin_state(reduced: xr.Dataset, baseline: xr.Dataset) -> State:
     return State(reduced, baseline, weight, np.zeros(weight.shape[:2], np.bool_))
 
 
-def drawn(cells: Cells, rng: np.random.Generator, count: int) -> Cells:
+def drawn(cells: LinearModel, rng: np.random.Generator, count: int) -> LinearModel:
     """The same cells with noise alone, `count` records of it."""
     spread = np.where(cells.weight > 0.0, 1.0 / np.sqrt(np.where(cells.weight > 0.0, cells.weight, 1.0)), 0.0)
     return cells._replace(values=spread[..., None] * rng.standard_normal((*spread.shape, count)))
@@ -137,7 +137,7 @@ def cross_without(reduced: xr.Dataset, left_out: NDArray[np.bool_]) -> xr.DataAr
     return reduced["cross"].where(~xr.DataArray(left_out[pairs].any(axis=1), dims=("pair", "block")))
 
 
-def view_rows(candidate: Candidate, state: State) -> list[tuple[str, ...]]:
+def statistic_rows(candidate: Candidate, state: State) -> list[tuple[str, ...]]:
     """Axes that each row of a view speaks about."""
     if candidate.view == "cross":
         return pair_rows(state.reduced)
@@ -147,7 +147,7 @@ def view_rows(candidate: Candidate, state: State) -> list[tuple[str, ...]]:
     return [(axis,) for axis in state.axes]
 
 
-def cells_of(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+def build_linear_model(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
     """One row of a view for candidates of that view that have the same rows; the designs are those of all their variants in order.
 
     Candidates of the view "transfer" must have the same witness.
@@ -190,7 +190,7 @@ def power_column(density: Array, row: int, state: State) -> Array:
     return np.broadcast_to(seen, state.weight.shape[1:])
 
 
-def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
     axis = state.axes[row]
     expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
     values = _records(data["power"].transpose(..., "axis", "block", "band").values, 3)[row] - expected[..., None]
@@ -205,7 +205,9 @@ def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
         for each in candidates
         for variant in each.variants
     ]
-    return independent(Cells(values, weight, designs, given, whole), state.baseline["common"].sel(axis=axis).values, state.weight[row])
+    return independent(
+        LinearModel(values, weight, designs, given, whole), state.baseline["common"].sel(axis=axis).values, state.weight[row]
+    )
 
 
 # --------------------------------------------------------------------------------------------------------------- crosses
@@ -222,7 +224,7 @@ def known_cross(baseline: xr.Dataset) -> Array | None:
     return np.asarray(baseline["cross"].transpose("pair", "block", "band").values) if "cross" in baseline else None
 
 
-def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
     pair = pair_rows(state.reduced)[row]
     i, j = (state.axes.index(axis) for axis in pair)
     known = known_cross(state.baseline)
@@ -239,7 +241,7 @@ def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
         for each in candidates
         for variant in each.variants
     ]
-    return Cells(_parts(values, axis=1), weight, designs, given, precision)
+    return LinearModel(_parts(values, axis=1), weight, designs, given, precision)
 
 
 # ---------------------------------------------------------------------------------------------------------------- orders
@@ -273,7 +275,7 @@ def order_columns(pattern: Array, chosen: tuple[int, ...]) -> list[Array]:
     return columns
 
 
-def _order(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+def _order(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
     values = _records(data["order"].transpose(..., "axis", "block", "harmonic").values, 3)
     weight = order_weight(state)
     count = weight.shape[-1]
@@ -281,7 +283,7 @@ def _order(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
         both = np.concatenate([weight[row], weight[row]], axis=1)
         designs = [_spread(order_columns(np.ones(count, complex), chosen), both.shape) for chosen in harmonic_sets(count)]
         given, precision = _beside(state, "order", (state.axes[row],), both.shape)
-        return Cells(_parts(values[row], axis=1), both, designs * len(candidates), given, precision)
+        return LinearModel(_parts(values[row], axis=1), both, designs * len(candidates), given, precision)
     both = np.concatenate([np.concatenate([one, one], axis=1) for one in weight], axis=1)  # the cells of all axes side by side
     stacked = np.concatenate([_parts(one, axis=1) for one in values], axis=1)
     designs = []
@@ -299,13 +301,13 @@ def _order(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
             given = np.concatenate([given, wide], axis=2)
     if given.shape[2]:
         precision = -np.eye(given.shape[2])
-    return Cells(stacked, both, designs, given, precision)
+    return LinearModel(stacked, both, designs, given, precision)
 
 
 # -------------------------------------------------------------------------------------------------------------- profiles
 
 
-def _profile(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
+def _profile(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
     values = _records(data["profile"].transpose(..., "axis", "block", "phase").values, 3)[row]
     rate = float(state.reduced.attrs["sampling_rate_hz"])
     width = (state.reduced["band_high"] - state.reduced["band_low"]).values
@@ -313,13 +315,13 @@ def _profile(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state:
     weight = state.reduced["profile_samples"].values[row] / variance[:, None]
     given, precision = _beside(state, "phase_locked", (state.axes[row],), weight.shape, [np.ones(weight.shape[1])], [-1.0])
     designs = [_spread(list(variant.design), weight.shape) for each in candidates for variant in each.variants]
-    return Cells(values, weight, designs, given, precision)
+    return LinearModel(values, weight, designs, given, precision)
 
 
 # ------------------------------------------------------------------------------------------------------------- transfers
 
 
-def witness_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset, baseline: xr.Dataset) -> tuple[Array, Array]:
+def reference_channel_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset, baseline: xr.Dataset) -> tuple[Array, Array]:
     """Cross-power of an axis with a channel or another axis, (block, band, record), and the power of that, (block, band).
 
     What both axes are known to share is taken off.
@@ -334,21 +336,21 @@ def witness_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset, basel
         for number, pair in enumerate(pair_rows(reduced)):
             if set(pair) == {name, axes[row]} and name != axes[row]:
                 found = np.where(there, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan)
-        return found, witness_power(name, reduced)
+        return found, reference_channel_power(name, reduced)
     place = [str(one) for one in reduced["witness"].values].index(name)
     cross = _records(data["witness_cross"].transpose(..., "axis", "witness", "block", "band").values, 4)
-    return cross[row, place], witness_power(name, reduced)
+    return cross[row, place], reference_channel_power(name, reduced)
 
 
-def witness_power(name: str, reduced: xr.Dataset) -> Array:
+def reference_channel_power(name: str, reduced: xr.Dataset) -> Array:
     """Power of a channel on the log's time, or of an axis as it measured, (block, band)."""
     if name in reduced["axis"].values:
         return np.asarray(measured(reduced, "power").sel(axis=name).transpose("block", "band").values)
     return np.asarray(reduced["witness_power"].sel(witness=name).transpose("block", "band").values)
 
 
-def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> Cells:
-    cross, power = witness_of(candidates[0].witness[0], row, data, state.reduced, state.baseline)
+def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
+    cross, power = reference_channel_of(candidates[0].witness[0], row, data, state.reduced, state.baseline)
     root = np.sqrt(np.where(power > 0.0, power, np.nan))
     share = _moving_share(candidates[0].witness[0], power, state)
     weight = 2.0 * state.reduced["shape"].values[row] / state.weight[row]
@@ -360,7 +362,7 @@ def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state
     designs = [
         _spread([_parts(one * root * share) for one in variant.design], weight.shape) for each in candidates for variant in each.variants
     ]
-    return Cells(values, weight, designs, given, precision)
+    return LinearModel(values, weight, designs, given, precision)
 
 
 def _moving_share(name: str, power: Array, state: State) -> Array:

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.candidates import Candidate, Variant, term_density
 
-__all__ = ["GENERICS", "generic_candidates", "splines", "stretches"]
+__all__ = ["NUISANCE_ALTERNATIVES", "nuisance_alternatives", "splines", "stretches"]
 
 Array = NDArray[np.float64]
 #: Name -> what it stands for.
-GENERICS = {
+NUISANCE_ALTERNATIVES = {
     "~bias(t)": "the bias wanders",
     "~N(t)": "the noise level changes",
     "~burst": "the noise is louder for a while",
@@ -59,7 +59,7 @@ def splines(begin: Array, end: Array, knots: int = _KNOTS) -> Array:
     return np.stack([np.interp(middle, places, row) for row in np.eye(knots)])
 
 
-def generic_candidates(reduced: xr.Dataset) -> list[Candidate]:
+def nuisance_alternatives(reduced: xr.Dataset) -> list[Candidate]:
     """Generics of all views that the record has."""
     hats = splines(reduced["begin"].values, reduced["end"].values)
     white = term_density("N", reduced["frequency"].values, float(reduced.attrs["sampling_rate_hz"]))

@@ -9,24 +9,24 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.fast_switching import Hops, hop_gain
+from gyrostab.diagnose.evidence.fast_switching import SwitchingEvidence, switching_evidence
 from gyrostab.diagnose.evidence.folds import fold_subsets
-from gyrostab.diagnose.evidence.held_out import cell_factors, mean_factors, score
+from gyrostab.diagnose.evidence.held_out import linear_model_factors, mean_factors, score
 from gyrostab.diagnose.evidence.sample_counts import (
-    OF_LATTICE,
+    GRID_COUNTS,
     Expected,
     beyond_ends,
-    coarse_lattice,
-    count_gains,
+    count_evidence,
     expected_counts,
-    kurtosis_gains,
+    has_coarse_grid,
+    kurtosis_evidence,
 )
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_gains
-from gyrostab.diagnose.evidence.telegraph import Courses, level_gains
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence
+from gyrostab.diagnose.evidence.telegraph import TelegraphCourses, telegraph_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.linear_model import State, cells_of, drawn, view_rows
+from gyrostab.diagnose.predict.linear_model import State, build_linear_model, drawn, statistic_rows
 
-__all__ = ["Found", "Tallies", "gains", "hops_within", "of_means", "together", "totals"]
+__all__ = ["CountEvidence", "Found", "compute_evidence", "fast_switching_evidence", "of_means", "together", "totals"]
 
 Array = NDArray[np.float64]
 _OF_MEANS, _TAILS = ("mean", "levels"), ("kurtosis", "outliers")  # views of means; what the means do not hear of
@@ -62,7 +62,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Tallies:
+class CountEvidence:
     """What null records say of counts: mean (axis, block) and spread (axis,) by name; of the kurtosis of a block both (axis,).
 
     And the axes whose rate was rounded to a lattice.
@@ -72,7 +72,7 @@ class Tallies:
     rounded: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     @classmethod
-    def gathered(cls, expected: Expected, rounded: NDArray[np.bool_]) -> Tallies:
+    def gathered(cls, expected: Expected, rounded: NDArray[np.bool_]) -> CountEvidence:
         """From all null records."""
         found = {}
         for name, parts in expected.sums.items():
@@ -88,13 +88,13 @@ class Tallies:
         return cls(found, rounded)
 
 
-def gains(
+def compute_evidence(
     candidates: Sequence[Candidate],
     data: xr.Dataset,
     state: State,
     folds: xr.DataArray,
     *,
-    tallies: Tallies | None = None,
+    tallies: CountEvidence | None = None,
     rng: np.random.Generator | None = None,
 ) -> list[Found]:
     """Gains of candidates on data.
@@ -188,30 +188,30 @@ def _means(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
 
 
 def _cells(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray, rng: np.random.Generator | None) -> list[Found]:
-    rows = view_rows(group[0], state)
+    rows = statistic_rows(group[0], state)
     if not rows:  # pairs of a single axis
         return []
     factors = []
     spread = 1
     for row in range(len(rows)):
         there = rng is None or (group[0].view in ("power", "cross") and group[0].view in data)
-        cells = cells_of(group, row, data if there else state.reduced, state)
+        cells = build_linear_model(group, row, data if there else state.reduced, state)
         if not there and rng is not None:
             cells = drawn(cells, rng, data.sizes["record"])
-        factors.append(cell_factors(cells, folds)[:, 1:])
+        factors.append(linear_model_factors(cells, folds)[:, 1:])
         spread = factors[-1].shape[1] // sum(len(each.variants) for each in group)
     return _collect(group, rows, factors, spread)
 
 
-def _marks(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray, tallies: Tallies) -> list[Found]:
+def _marks(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray, tallies: CountEvidence) -> list[Found]:
     subsets = fold_subsets(folds)
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
-    coarse = coarse_lattice(state.reduced)
+    coarse = has_coarse_grid(state.reduced)
     out = []
     for each in group:
         gain, best = [], []
         for variant in each.variants:
-            parts = [np.where(coarse & (name in OF_LATTICE), 0.0, _mark(name, data, state, subsets, tallies)) for name in variant.columns]
+            parts = [np.where(coarse & (name in GRID_COUNTS), 0.0, _mark(name, data, state, subsets, tallies)) for name in variant.columns]
             gain.append(np.max(parts, axis=0))
         place = np.argmax([one[0] for one in gain], axis=0)
         best = [each.variants[int(number)] for number in place]
@@ -219,7 +219,7 @@ def _marks(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
     return out
 
 
-def _mark(name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_], tallies: Tallies) -> Array:
+def _mark(name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_], tallies: CountEvidence) -> Array:
     """Gain of a raised statistic, (record, axis)."""
     records = data.sizes.get("record", 1)
     if name == "lattice":
@@ -229,11 +229,11 @@ def _mark(name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_],
     values = data[name].transpose(..., "axis", "block").values.astype(np.float64)
     values = values if values.ndim == 3 else values[None]
     values = beyond_ends(values) if name == "extremes" else values
-    how = kurtosis_gains if name == "kurtosis" else count_gains
+    how = kurtosis_evidence if name == "kurtosis" else count_evidence
     return how(values, *tallies.of[name], subsets)
 
 
-def _lattice(state: State, tallies: Tallies) -> Array:
+def _lattice(state: State, tallies: CountEvidence) -> Array:
     """Samples of a rounded rate, one nat each: noise without a lattice never stands on it."""
     samples = state.reduced["samples"].transpose("axis", "block").values.sum(axis=1)
     return np.where(tallies.rounded, samples, 0.0).astype(np.float64) if tallies.rounded.size else np.zeros(samples.size)
@@ -243,7 +243,7 @@ def _lines(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[F
     power = data["line_power"].transpose(..., "axis", "part", "line").values
     power = power if power.ndim == 4 else power[None]
     expected = expected_lines(state.baseline, state.reduced["line_frequency"].values)
-    gain = line_gains(power, state.reduced["line_weight"].transpose("axis", "part").values, expected)
+    gain = line_evidence(power, state.reduced["line_weight"].transpose("axis", "part").values, expected)
     taken = state.given.get(("line", "all"), [])
     for mask in taken:
         gain = np.where(mask, -np.inf, gain)
@@ -265,10 +265,10 @@ def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[
     some = data.isel(record=slice(max(1, _MOST_BLOCKS // data.sizes["block"]))) if "record" in data.dims else data
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     gain = np.full((records, len(rows)), -np.inf)
-    courses: list[tuple[Courses, Hops | None]] = []
+    courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
     for row, axis in enumerate(state.axes):
         given = state.given.get(("mean", axis))
-        found, course = level_gains(some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None)
+        found, course = telegraph_evidence(some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None)
         gain[: found.size, row] = found
         within, refuted = _within(some, state, axis, course, float(found[0]))
         if refuted:
@@ -279,7 +279,7 @@ def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[
     return [Found(each, rows, gain, tuple(_course(each.variants[0], *one, state) for one in courses)) for each in group]
 
 
-def _within(data: xr.Dataset, state: State, axis: str, course: Courses, gain: float) -> tuple[Hops | None, bool]:
+def _within(data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, gain: float) -> tuple[SwitchingEvidence | None, bool]:
     """Hops within blocks, where these tell more than the means of blocks do; and whether they say that there are not two levels."""
     found, block = _hops(data, state, axis), float(state.reduced.attrs["block_s"])
     if found is None:
@@ -291,26 +291,26 @@ def _within(data: xr.Dataset, state: State, axis: str, course: Courses, gain: fl
     return (None if coarse and found.times.min() > _WITHIN * block else found), False
 
 
-def hops_within(data: xr.Dataset, state: State, axis: str) -> Hops | None:
+def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
     """Two levels between which the bias hops within blocks; None where there are none."""
     found = _hops(data, state, axis)
     return found if found is not None and _resolved(found, float(state.reduced.attrs["block_s"])) else None
 
 
-def _resolved(found: Hops, block: float) -> bool:
+def _resolved(found: SwitchingEvidence, block: float) -> bool:
     """Whether pieces of blocks of so many seconds tell two levels; what is shorter than a piece is a spike."""
     return bool(np.isfinite(found.gain)) and float(found.times.min()) >= block / found.share.shape[1]
 
 
-def _hops(data: xr.Dataset, state: State, axis: str) -> Hops | None:
+def _hops(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
     """What pieces of blocks say; None where more is named in the means of blocks than is known of their pieces."""
     known, inner = (state.given.get((view, axis), []) for view in ("mean", "inner"))
     if len(inner) < len(known):
         return None
-    return hop_gain(data, state.baseline, axis=axis, given=np.stack(inner, axis=-1) if inner else None)
+    return switching_evidence(data, state.baseline, axis=axis, given=np.stack(inner, axis=-1) if inner else None)
 
 
-def _course(variant: Variant, found: Courses, within: Hops | None, state: State) -> Variant:
+def _course(variant: Variant, found: TelegraphCourses, within: SwitchingEvidence | None, state: State) -> Variant:
     """The variant with the course of the first record, and its mean times [s]."""
     if within is not None:
         low, high = within.times

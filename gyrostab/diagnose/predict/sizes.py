@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.evidence.wandering import known_wander
 from gyrostab.diagnose.predict.candidates import Variant
-from gyrostab.diagnose.predict.condition import Part, mean_columns
-from gyrostab.diagnose.predict.linear_model import State, cells_of, view_rows
+from gyrostab.diagnose.predict.condition import Component, mean_columns
+from gyrostab.diagnose.predict.linear_model import State, build_linear_model, statistic_rows
 
-__all__ = ["Mixture", "mean_mixture", "part_mixture", "part_size"]
+__all__ = ["Mixture", "component_mixture", "component_size", "mean_mixture"]
 
 Array = NDArray[np.float64]
 _RIDGE = 1e-12
@@ -91,15 +91,15 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     return Mixture(log_weight, mean[:, :own] / scale, covariance[:, :own, :own] / np.outer(scale, scale))
 
 
-def part_mixture(part: Part, state: State, variant: Variant | None = None, *, variance: Array | None = None) -> Mixture:
+def component_mixture(part: Component, state: State, variant: Variant | None = None, *, variance: Array | None = None) -> Mixture:
     """Sizes of a part's columns, in the unit of the parameters (or their squares), when `state` is in the model beside it."""
     variant = variant or part.variant
     if part.candidate.view in ("mean", "levels"):
         row = state.axes.index(part.row[0])
         return mean_mixture(state, part.row[0], mean_columns(variant, row), variance=variance)
     candidate = replace(part.candidate, variants=(variant,))
-    row = view_rows(candidate, state).index(part.row)
-    cells = cells_of([candidate], row, state.reduced, state)
+    row = statistic_rows(candidate, state).index(part.row)
+    cells = build_linear_model([candidate], row, state.reduced, state)
     design = cells.designs[max(part.place, 0) if part.candidate.view == "order" else 0]
     columns = np.concatenate([design, cells.given], axis=2).reshape(-1, design.shape[2] + cells.given.shape[2])
     weight = np.where(np.isfinite(cells.weight) & np.isfinite(cells.values[..., 0]), cells.weight, 0.0).ravel()
@@ -121,9 +121,9 @@ def part_mixture(part: Part, state: State, variant: Variant | None = None, *, va
     return Mixture(np.array([log_weight]), (mean[:own] / scale)[None], own_covariance[None])
 
 
-def part_size(part: Part, state: State) -> tuple[float, float]:
+def component_size(part: Component, state: State) -> tuple[float, float]:
     """Size of the first column and its standard error; zero and infinite for a view that has no size."""
     if part.candidate.view in ("marks", "line", "wander"):
         return 0.0, np.inf
-    mean, covariance = part_mixture(part, state).moments()
+    mean, covariance = component_mixture(part, state).moments()
     return float(mean[0]), float(np.sqrt(covariance[0, 0]))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.accumulate import FINE, FOLLOWED, HARMONICS, PARTS, PHASES, Accumulator
 from gyrostab.diagnose.reduce.log_blocks import channel_means, numeric_channels, read_stretches, row_count, sample_count
-from gyrostab.diagnose.reduce.outliers import beyond_chance, count_outliers, lattice_step
+from gyrostab.diagnose.reduce.outliers import beyond_chance, count_outliers, quantization_step
 from gyrostab.diagnose.reduce.zero_bin import CELLS, cell_widths
 from gyrostab.errors import OptionError
 from gyrostab.kernels.regression.smooth import smooth_curve
@@ -187,7 +187,7 @@ def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Datas
     peaks, outliers = count_outliers(work.histogram, work.peaks)
     subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
     filled = beyond_chance(work.together, counts[..., 1], present, subset, at_once)
-    lattice = np.array([lattice_step(_kept(work, row, _FOR_STEP)) for row in range(work.axes)])
+    lattice = np.array([quantization_step(_kept(work, row, _FOR_STEP)) for row in range(work.axes)])
     cells = np.array([cell_widths(_kept(work, row), step) for row, step in enumerate(lattice)])
     weight = np.divide(work.line_counts[..., 0] ** 2, work.line_counts[..., 1], where=work.line_counts[..., 1] > 0,
                        out=np.zeros(work.line_counts.shape[:2]))  # fmt: skip

@@ -17,8 +17,8 @@ __all__ = [
     "chance_of_all",
     "count_outliers",
     "find_peaks",
-    "lattice_step",
     "outlier_limit",
+    "quantization_step",
     "samples_at_once",
     "zeros_together",
 ]
@@ -273,7 +273,7 @@ def chance_of_all(share: Array, subset: NDArray[np.bool_]) -> Array:
     return np.asarray(np.stack([np.prod(share[..., np.flatnonzero(one), :], axis=-2) for one in subset], axis=-2))
 
 
-def lattice_step(values: Array) -> float:
+def quantization_step(values: Array) -> float:
     """Step of the lattice that values stand on, whatever its offset; 0 when there is none, or when it is too fine to matter.
 
     Parameters

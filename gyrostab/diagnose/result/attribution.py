@@ -10,13 +10,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.known_effects import known_motion
-from gyrostab.diagnose.identify.forward_search import Claim
+from gyrostab.diagnose.baseline.known_effects import expect_known_motion
+from gyrostab.diagnose.identify.forward_search import Identification
 from gyrostab.diagnose.nulls.scores import NullScores
-from gyrostab.diagnose.predict.condition import Part, mean_columns, odd_blocks
-from gyrostab.diagnose.result.attribution_weights import Scores, left_of, needed, view_scores
+from gyrostab.diagnose.predict.condition import Component, find_anomalous_blocks, mean_columns
+from gyrostab.diagnose.result.attribution_weights import Scores, left_of, needed, statistic_scores
 
-__all__ = ["acting", "explanations", "spans", "unexpected"]
+__all__ = ["active_spans", "attribute_mismatches", "spans", "unexpected"]
 
 Array = NDArray[np.float64]
 #: Where an effect shows -> views of mismatches that it can explain; "model" ones are looked at again with the effect in the model.
@@ -43,7 +43,7 @@ _MOVES = ("mean", "levels")  # parts that may move the rate within a block, whic
 _MOVED = 0.1  # of the largest step from block to block
 
 
-def acting(claim: Claim, reduced: xr.Dataset) -> NDArray[np.bool_]:
+def active_spans(claim: Identification, reduced: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks in which an effect does something, from its designs and from the turning of the tool; all where neither depends on time."""
     blocks = reduced.sizes["block"]
     there = np.zeros(blocks, bool)
@@ -99,15 +99,15 @@ def spans(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[floa
     return [(float(begin[first]), float(end[stop - 1])) for first, stop in joined]
 
 
-def explanations(
+def attribute_mismatches(
     found: xr.Dataset,
-    claims: Sequence[Claim],
+    claims: Sequence[Identification],
     reduced: xr.Dataset,
     after: xr.Dataset,
     null: NullScores,
     *,
     level: float,
-    without: Callable[[Sequence[Claim]], xr.Dataset] | None = None,
+    without: Callable[[Sequence[Identification]], xr.Dataset] | None = None,
     still: xr.Dataset | None = None,
 ) -> list[list[str]]:
     """Effects that explain each mismatch.
@@ -120,7 +120,7 @@ def explanations(
     Parameters
     ----------
     found : xarray.Dataset
-        From `gyrostab.diagnose.locate.mismatches.locate`.
+        From `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
     claims : sequence of Claim
     reduced, after : xarray.Dataset
         The recording, and the baseline with the effects.
@@ -140,14 +140,14 @@ def explanations(
         Names, for each mismatch.
     """
     boxes = [{str(name): found[name].values[number] for name in found.data_vars} for number in range(found.sizes["mismatch"])]
-    scores = view_scores(reduced, after, null, boxes, claims, still=still)
+    scores = statistic_scores(reduced, after, null, boxes, claims, still=still)
     known: dict[tuple[int, ...], Scores] = {(): scores}
 
-    def left(box: Mapping[str, Any], out: Sequence[Claim]) -> tuple[float, float]:
+    def left(box: Mapping[str, Any], out: Sequence[Identification]) -> tuple[float, float]:
         chosen = tuple(number for number, claim in enumerate(claims) if any(claim is one for one in out))
         if chosen not in known and without is not None:
             rest = [claim for number, claim in enumerate(claims) if number not in chosen]
-            known[chosen] = view_scores(reduced, without(out), null, boxes, rest, still=still)
+            known[chosen] = statistic_scores(reduced, without(out), null, boxes, rest, still=still)
         return left_of(box, known[chosen], null, level)
 
     when = [_reach(claim, reduced) for claim in claims]
@@ -177,7 +177,7 @@ def explanations(
 
 
 def unexpected(
-    found: xr.Dataset, expected: Sequence[Claim], reduced: xr.Dataset, before: xr.Dataset, null: NullScores, *, level: float
+    found: xr.Dataset, expected: Sequence[Identification], reduced: xr.Dataset, before: xr.Dataset, null: NullScores, *, level: float
 ) -> xr.Dataset:
     """Mismatches without those that effects explain which the simulation has as well.
 
@@ -191,9 +191,11 @@ def unexpected(
     null : NullScores
     level : float
     """
-    odd = [one for one in expected if any(part.candidate.view == "marks" and odd_blocks(part, reduced).any() for part in one.parts)]
+    odd = [
+        one for one in expected if any(part.candidate.view == "marks" and find_anomalous_blocks(part, reduced).any() for part in one.parts)
+    ]
     others = [one for one in expected if one not in odd]
-    by_count, by_all = (explanations(found, claims, reduced, before, null, level=level) for claims in (odd, others))
+    by_count, by_all = (attribute_mismatches(found, claims, reduced, before, null, level=level) for claims in (odd, others))
     told = [
         bool(named) or (bool(counted) and view == "distribution")
         for view, counted, named in zip(found["view"].values, by_count, by_all, strict=True)
@@ -201,7 +203,7 @@ def unexpected(
     return found.isel(mismatch=~np.array(told, np.bool_)) if expected else found
 
 
-def _beside(box: Mapping[str, Any], parts: Sequence[Part], left: Callable[[], tuple[float, float]]) -> bool:
+def _beside(box: Mapping[str, Any], parts: Sequence[Component], left: Callable[[], tuple[float, float]]) -> bool:
     """Whether a mismatch of the mean is there for what an effect does at other times.
 
     The constant of a record is free: a mean that is higher in one part is one that is lower in the rest, and either may stand out.
@@ -212,14 +214,14 @@ def _beside(box: Mapping[str, Any], parts: Sequence[Part], left: Callable[[], tu
     return score >= limit
 
 
-def _modelled(claim: Claim, box: Mapping[str, Any]) -> set[str]:
+def _modelled(claim: Identification, box: Mapping[str, Any]) -> set[str]:
     """Parts that must take the mismatch away; that several axes wander as one is in no model, and what wanders on them may do it."""
     held = {*_MODELLED, "line", "marks"} if box["view"] == "cross_axis" else set(_MODELLED)
     wanders = str(box["what"]) == "slow" and len(set(str(box["axes"]).split()) & set(claim.axes)) > 1
     return held - ({"wander"} if wanders else set())
 
 
-def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
+def _can_show(part: Component, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
     """Whether a part of an effect can be seen where a mismatch is.
 
     A line explains a line at its own frequency only, and a mean of what axes share only what is slow.
@@ -240,12 +242,12 @@ def _can_show(part: Part, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
     return str(box["what"]).startswith(("avar", "level", "restless")) and bool(box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE)
 
 
-def _reach(claim: Claim, reduced: xr.Dataset) -> list[tuple[float, float]]:
+def _reach(claim: Identification, reduced: xr.Dataset) -> list[tuple[float, float]]:
     """Stretches whose mismatches an effect can explain: a line of the turning stands out also where a part turns but little."""
     begin, end = reduced["begin"].values, reduced["end"].values
     if any(part.candidate.view == "order" for part in claim.parts):
         return [(float(begin[0]), float(end[-1]))]
-    return spans(acting(claim, reduced), begin, end)
+    return spans(active_spans(claim, reduced), begin, end)
 
 
 def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
@@ -261,9 +263,9 @@ def _is_inside(box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
     return str(box["view"]) in ("spectrum", "distribution") or float(box["tau_max_s"]) < float(reduced.attrs["block_s"])
 
 
-def _moves(claim: Claim, reduced: xr.Dataset, after: xr.Dataset) -> list[tuple[float, float]]:
+def _moves(claim: Identification, reduced: xr.Dataset, after: xr.Dataset) -> list[tuple[float, float]]:
     """Blocks [s] in which an effect moves the rate of an axis too fast for what is said of their inside."""
-    axes, moving = [str(axis) for axis in reduced["axis"].values], known_motion(reduced, after)
+    axes, moving = [str(axis) for axis in reduced["axis"].values], expect_known_motion(reduced, after)
     there = np.zeros(reduced.sizes["block"], np.bool_)
     for part in (part for part in claim.parts if part.candidate.view in _MOVES and part.variant.design.size):
         row = axes.index(part.row[0])

@@ -9,17 +9,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.known_effects import without_known_motion
-from gyrostab.diagnose.identify.identification import Claim
+from gyrostab.diagnose.baseline.known_effects import remove_known_motion
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.locate.mismatches import louder
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
-from gyrostab.diagnose.predict.condition import Part, without_odd, without_turns
+from gyrostab.diagnose.predict.condition import Component, mask_anomalous_blocks, without_turns
 from gyrostab.diagnose.predict.filter_response import is_filter
 from gyrostab.diagnose.predict.linear_model import pair_rows
-from gyrostab.diagnose.statistics import VIEWS
+from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.variance_stability import levelled
 
-__all__ = ["Scores", "left_of", "needed", "view_scores"]
+__all__ = ["Scores", "left_of", "needed", "statistic_scores"]
 
 Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
 Box = Mapping[str, Any]
@@ -36,12 +36,12 @@ _LEFT = 0.3  # of a mismatch, that an error of the form may leave
 _FAIR = 0.5  # of an equal share
 
 
-def view_scores(
+def statistic_scores(
     reduced: xr.Dataset,
     after: xr.Dataset,
     null: NullScores,
     boxes: Sequence[Box],
-    claims: Iterable[Claim] = (),
+    claims: Iterable[Identification] = (),
     *,
     still: xr.Dataset | None = None,
 ) -> Scores:
@@ -51,21 +51,21 @@ def view_scores(
     the rate; so do the lines of `still`, which are those of `reduced` by default.
     """
     out = []
-    reduced = without_known_motion(reduced, after)
+    reduced = remove_known_motion(reduced, after)
     after = _with_shared_lines(reduced, after, claims := list(claims))
-    seen = without_odd(reduced, [part for claim in claims for part in claim.parts])
+    seen = mask_anomalous_blocks(reduced, [part for claim in claims for part in claim.parts])
     turns_left_out = without_turns(reduced, after["spectrum"].transpose("axis", "block", "band").values)
     special = {"distribution": turns_left_out, "restless": levelled(seen, after, louder(boxes))}
     if still is not None:
         special |= dict.fromkeys(_OF_LINES, seen.assign({name: still[name] for name in ("line_power", "line_weight")}))
-    for name, score in VIEWS.items():
+    for name, score in STATISTICS.items():
         scores = score(special.get(name, seen), after) if name in null.views else None
         if scores is not None:
             out.append((name, scores, standardise(scores, null.views[name])))
     return out
 
 
-def _with_shared_lines(reduced: xr.Dataset, after: xr.Dataset, claims: Sequence[Claim]) -> xr.Dataset:
+def _with_shared_lines(reduced: xr.Dataset, after: xr.Dataset, claims: Sequence[Identification]) -> xr.Dataset:
     """The baseline with the covariance of a line that axes have in common: its mean over the record, in the bands where the line is.
 
     The lowest band stays as it is, for it tells what the means of the blocks share.
@@ -108,7 +108,9 @@ def left_of(box: Box, scores: Scores, null: NullScores, level: float) -> tuple[f
     return left, limit
 
 
-def needed(box: Box, shown: Sequence[tuple[Claim, Sequence[Part]]], left: Callable[[Sequence[Claim]], tuple[float, float]]) -> list[Claim]:
+def needed(
+    box: Box, shown: Sequence[tuple[Identification, Sequence[Component]]], left: Callable[[Sequence[Identification]], tuple[float, float]]
+) -> list[Identification]:
     """Those of the effects in the place of a mismatch that it takes to explain it.
 
     It takes an effect without which alone the mismatch would be one again. Of several that do the same, none is so: it takes each that
@@ -139,6 +141,6 @@ def needed(box: Box, shown: Sequence[tuple[Claim, Sequence[Part]]], left: Callab
     return [one for one, _ in shown if id(one) not in dropped]
 
 
-def _is_weighed(part: Part, box: Box) -> bool:
+def _is_weighed(part: Component, box: Box) -> bool:
     """Whether a view holds what a part brings; a low-pass may be in the noise of the baseline by now."""
     return part.candidate.view in _WEIGHED.get(str(box["view"]), ()) and not is_filter(part.candidate.view, part.variant)

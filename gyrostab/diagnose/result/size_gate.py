@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted
-from gyrostab.diagnose.identify.components import gain_sum
-from gyrostab.diagnose.identify.identification import Claim, Naming, Unknown
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.identify.components import sum_evidence
+from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.physics.registry import effects
 
-__all__ = ["has_zero", "supported_axes", "with_supported_claims"]
+__all__ = ["has_zero", "keep_supported", "supported_axes"]
 
 #: View of a part of an effect -> nuisance alternative that its unexplained rest is reported as.
 _REST = {
@@ -48,7 +48,7 @@ def supported_axes(fitted: Fitted) -> tuple[str, ...]:
     return tuple(found)
 
 
-def with_supported_claims(naming: Naming, fitted: Sequence[Sequence[Fitted]]) -> Naming:
+def keep_supported(naming: Identifications, fitted: Sequence[Sequence[Fitted]]) -> Identifications:
     """Keep the effects whose size is away from zero, on the axes where it is.
 
     What an effect gained on the other axes stays in the naming as something unknown where that
@@ -65,8 +65,8 @@ def with_supported_claims(naming: Naming, fitted: Sequence[Sequence[Fitted]]) ->
     Naming
         `naming` itself when every effect keeps all of its axes.
     """
-    claims: list[Claim] = []
-    unknown: list[Unknown] = []
+    claims: list[Identification] = []
+    unknown: list[Unidentified] = []
     changed = False
     for claim, numbers in zip(naming.claims, fitted, strict=True):
         good = {axis for one in numbers for axis in supported_axes(one)}
@@ -75,13 +75,13 @@ def with_supported_claims(naming: Naming, fitted: Sequence[Sequence[Fitted]]) ->
             claims.append(claim)
             continue
         lost = tuple(part for part in claim.parts if part not in kept)
-        if gain_sum(kept) > claim.threshold:
+        if sum_evidence(kept) > claim.threshold:
             axes = tuple(axis for axis in claim.axes if axis in good)
-            gain = min(claim.gain, gain_sum(kept))
+            gain = min(claim.gain, sum_evidence(kept))
             claims.append(replace(claim, parts=kept, axes=axes, gain=gain))
         else:
             lost = claim.parts
-        if gain_sum(lost) > claim.threshold:
+        if sum_evidence(lost) > claim.threshold:
             unknown.append(_unsupported(claim, lost))
         changed = True
     if not changed:
@@ -89,9 +89,9 @@ def with_supported_claims(naming: Naming, fitted: Sequence[Sequence[Fitted]]) ->
     return replace(naming, claims=tuple(claims), unknown=(*naming.unknown, *unknown))
 
 
-def _unsupported(claim: Claim, parts: tuple[Part, ...]) -> Unknown:
+def _unsupported(claim: Identification, parts: tuple[Component, ...]) -> Unidentified:
     """Turn the parts of an effect whose size may be zero into something unknown."""
     strongest = max(parts, key=lambda part: part.gain).candidate.view
     axes = tuple(axis for axis in claim.axes if any(axis in part.row for part in parts))
     generic = _REST.get(strongest, "~S(f)")
-    return Unknown(generic, axes, gain_sum(parts), claim.threshold, (claim.effect,), parts)
+    return Unidentified(generic, axes, sum_evidence(parts), claim.threshold, (claim.effect,), parts)

@@ -12,12 +12,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.joint_fit import Fitted
-from gyrostab.diagnose.estimate.upper_limits import Limit
-from gyrostab.diagnose.identify.forward_search import Claim, Naming, Unknown
-from gyrostab.diagnose.predict.condition import Part
-from gyrostab.diagnose.predict.nuisance import GENERICS
+from gyrostab.diagnose.estimate.upper_limits import UpperLimit
+from gyrostab.diagnose.identify.forward_search import Identification, Identifications, Unidentified
+from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.nuisance import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.reduce.block_statistics import measured
-from gyrostab.diagnose.result.attribution import acting, spans
+from gyrostab.diagnose.result.attribution import active_spans, spans
 from gyrostab.diagnose.result.diagnosis import effect_table
 from gyrostab.diagnose.result.text import (
     axes_text,
@@ -37,8 +37,8 @@ from gyrostab.simulate.model import Model
 __all__ = [
     "baseline_table",
     "chance_of_gain",
-    "claim_tables",
     "effect_tables",
+    "identification_tables",
     "iso",
     "limit_tables",
     "mismatch_tables",
@@ -46,7 +46,7 @@ __all__ = [
     "motion_tables",
     "recording_table",
     "surfaces_with_blocks",
-    "unknown_tables",
+    "unidentified_tables",
 ]
 
 Array = NDArray[np.float64]
@@ -138,7 +138,7 @@ def chance_of_gain(best: Array, gain: float) -> float:
     return max(_TAIL * math.exp(-(gain - start) / scale), _LEAST_P)
 
 
-def claim_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def identification_tables(naming: Identifications, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Mismatches that only naming saw: where a named effect acts that explains none of those known, by its strongest part."""
     out: list[dict[str, Any]] = []
     begin, end = reduced["begin"].values, reduced["end"].values
@@ -149,7 +149,7 @@ def claim_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[st
         view = _PART_VIEW.get(strongest.candidate.view, "davar")
         low, high = _taus(strongest, view, reduced)
         p_value = chance_of_gain(naming.null_best, claim.gain)
-        for first, last in spans(acting(claim, reduced), begin, end):
+        for first, last in spans(active_spans(claim, reduced), begin, end):
             when = span_text(first, last, float(end[-1]))
             out.append(
                 {
@@ -169,7 +169,7 @@ def claim_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[st
     return out
 
 
-def _taus(part: Part, view: str, reduced: xr.Dataset) -> tuple[float, float]:
+def _taus(part: Component, view: str, reduced: xr.Dataset) -> tuple[float, float]:
     """Averaging times [s] at which a part of an effect shows: those of its line, of block means, or those within a block."""
     block, whole = float(reduced.attrs["block_s"]), float(reduced["end"].values[-1])
     if part.candidate.view == "line" and part.place >= 0:
@@ -180,7 +180,7 @@ def _taus(part: Part, view: str, reduced: xr.Dataset) -> tuple[float, float]:
     return 1.0 / float(reduced.attrs["sampling_rate_hz"]), block
 
 
-def unknown_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def unidentified_tables(naming: Identifications, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Mismatches that only naming saw: what no effect explains, where no box that is left says so already."""
     out: list[dict[str, Any]] = []
     for one in naming.unknown:
@@ -191,11 +191,11 @@ def unknown_tables(naming: Naming, reduced: xr.Dataset, known: Sequence[Mapping[
     return out
 
 
-def _unknown_table(one: Unknown, naming: Naming, reduced: xr.Dataset, number: int, view: str) -> dict[str, Any]:
+def _unknown_table(one: Unidentified, naming: Identifications, reduced: xr.Dataset, number: int, view: str) -> dict[str, Any]:
     p_value = chance_of_gain(naming.null_best, one.gain)
     near = ", ".join(plain_name(name) for name in one.candidates)
     beside = f"; what comes nearest: {near}" if near else ""
-    means, what = view == "mean", GENERICS.get(one.generic, "something differs")
+    means, what = view == "mean", NUISANCE_ALTERNATIVES.get(one.generic, "something differs")
     rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
     begin, end, when = _when(one, reduced)
     return {
@@ -213,7 +213,7 @@ def _unknown_table(one: Unknown, naming: Naming, reduced: xr.Dataset, number: in
     }
 
 
-def _when(one: Unknown, reduced: xr.Dataset) -> tuple[float, float, str]:
+def _when(one: Unidentified, reduced: xr.Dataset) -> tuple[float, float, str]:
     """Begin and end of what has no name [s], with words for an event; else the whole record."""
     whole = float(reduced["end"].values[-1])
     found = [(part.variant.values["begin"], part.variant.values["end"]) for part in one.parts if "begin" in part.variant.values]
@@ -223,7 +223,7 @@ def _when(one: Unknown, reduced: xr.Dataset) -> tuple[float, float, str]:
     return begin, end, f", {span_text(begin, end, whole)}"
 
 
-def motion_tables(claims: Sequence[Claim], reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def motion_tables(claims: Sequence[Identification], reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """One mismatch for every axis whose moving stretches were left out of the comparison, from the first of them to the last."""
     if "moving" not in reduced:
         return []
@@ -254,7 +254,7 @@ def motion_tables(claims: Sequence[Claim], reduced: xr.Dataset, known: Sequence[
     return out
 
 
-def _followers(axis: str, claims: Sequence[Claim]) -> list[str]:
+def _followers(axis: str, claims: Sequence[Identification]) -> list[str]:
     """Axes on which the rate of an axis is seen through a lean of theirs."""
     parts = [part for claim in claims if claim.effect == "misalignment" for part in claim.parts]
     return sorted({name for part in parts if axis in (*part.variant.columns, *part.candidate.witness) for name in part.row})
@@ -271,7 +271,7 @@ def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[st
     out = []
     for one in fitted:
         claim = one.claim
-        when = spans(acting(claim, reduced), begin, end)
+        when = spans(active_spans(claim, reduced), begin, end)
         whole = float(end[-1])
         out.append(
             {
@@ -292,7 +292,7 @@ def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[st
     return sorted(out, key=lambda table: -table["held_out_gain"]["nats"])
 
 
-def limit_tables(found: Mapping[str, Limit]) -> dict[str, Any]:
+def limit_tables(found: Mapping[str, UpperLimit]) -> dict[str, Any]:
     """How large what was not found may be, and why it was not."""
     return {name: {"upper_limit": one.upper_limit, "unit": one.unit, "reason": one.reason} for name, one in found.items()}
 

@@ -20,10 +20,10 @@ from gyrostab.diagnose.statistics import sample_counts as distribution
 from gyrostab.diagnose.statistics import spectral_line as spectrum
 from gyrostab.diagnose.statistics import variance_stability as restless
 
-__all__ = ["VIEWS"]
+__all__ = ["STATISTICS"]
 
 #: Every view by a name of its own; the name in the contract is the attribute ``view`` of what it gives.
-VIEWS: dict[str, Callable[[xr.Dataset, xr.Dataset], xr.Dataset | None]] = {
+STATISTICS: dict[str, Callable[[xr.Dataset, xr.Dataset], xr.Dataset | None]] = {
     "davar": davar.score,
     "mean": mean.score,
     "cross_axis": cross_axis.score,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.wandering import known_wander
 from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, values_of, view_dataset, window_set
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of, window_set
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
 
@@ -66,7 +66,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         r = np.concatenate([r, np.sqrt((r**2).mean(axis=-3, keepdims=True))], axis=-3)
         rows = [*rows, " ".join(axes)]
     block = float(reduced.attrs["block_s"])
-    return view_dataset(
+    return statistic_dataset(
         "cross_axis",
         reduced,
         rows=rows,

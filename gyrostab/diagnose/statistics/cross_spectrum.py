@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, values_of, view_dataset, window_set
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of, window_set
 
 __all__ = ["LENGTHS", "correlation_score", "score"]
 
@@ -54,7 +54,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     low, high = reduced["band_low"].values, reduced["band_high"].values
     low = np.maximum(low, 0.5 / float(reduced.attrs["block_s"]))
     f_min, f_max = np.append(low, low[0]), np.append(high, high[-1])
-    return view_dataset(
+    return statistic_dataset(
         "cross_axis",
         reduced,
         rows=rows,

@@ -10,7 +10,7 @@ import xarray as xr
 from scipy.special import log_ndtr
 
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, local_level
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, exponential_score, values_of, view_dataset
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, exponential_score, statistic_dataset, values_of
 
 __all__ = ["score"]
 
@@ -69,7 +69,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         more = np.exp(np.log(_INDEPENDENT * ways) + log_ndtr(-largest))  # ways of noise that would do as much
         z = np.where(ways > 0, exponential_score(-np.log(-np.expm1(-np.minimum(more, _USUAL)))), np.nan)
     blocks = -(-np.arange(power.shape[-2] + 1) * reduced.sizes["block"] // power.shape[-2])
-    return view_dataset(
+    return statistic_dataset(
         "spectrum",
         reduced,
         rows=axes,

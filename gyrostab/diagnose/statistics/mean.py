@@ -8,12 +8,12 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.evidence.wandering import known_wander, mean_share
-from gyrostab.diagnose.statistics.scores import Array, Windows, over_windows, values_of, view_dataset, window_set
+from gyrostab.diagnose.statistics.scores import Array, Windows, over_windows, statistic_dataset, values_of, window_set
 from gyrostab.kernels.regression.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
 from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.noise import HOUR
 
-__all__ = ["LENGTHS", "MeanNoise", "box_mean", "mean_noise", "precision", "score", "window_means"]
+__all__ = ["LENGTHS", "MeanNoise", "mean_noise", "precision", "region_mean", "score", "window_means"]
 
 #: Lengths of the windows [blocks].
 LENGTHS = (1, 5, 15, 45)
@@ -44,14 +44,14 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        See `gyrostab.diagnose.statistics.scores.view_dataset`; ``estimate`` is the constant [degree hour-1].
+        See `gyrostab.diagnose.statistics.scores.statistic_dataset`; ``estimate`` is the constant [degree hour-1].
     """
     windows = window_set(reduced.sizes["block"], LENGTHS, whole=False)
     amount, information = window_means(reduced, baseline, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         z, estimate = (amount / np.sqrt(information))[..., None], (amount / information)[..., None]
     block = float(reduced.attrs["block_s"])
-    return view_dataset(
+    return statistic_dataset(
         "mean",
         reduced,
         windows=windows,
@@ -142,7 +142,7 @@ def precision(series: Array, noise: MeanNoise) -> Array:
     return out.reshape(series.shape)
 
 
-def box_mean(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:
+def region_mean(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:
     """Constant that stands in some blocks of a recording alone, by generalised least squares beside one of the record [degree hour-1]."""
     residual = values_of(reduced, "mean", "axis", "block")[axis] - values_of(baseline, "known_mean", "axis", "block")[axis]
     noise = mean_noise(reduced, baseline, axis, np.isfinite(residual))

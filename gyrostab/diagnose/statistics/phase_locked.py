@@ -12,8 +12,8 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     exponential_score,
     over_windows,
+    statistic_dataset,
     values_of,
-    view_dataset,
     window_set,
 )
 
@@ -57,7 +57,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     if not found:
         return None
     z, ratio, estimate = (np.concatenate(part, axis=-1) for part in zip(*found, strict=True))
-    return view_dataset(
+    return statistic_dataset(
         "spectrum",
         reduced,
         windows=windows,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, values_of, view_dataset, window_set
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of, window_set
 from gyrostab.noise import LAWS
 
 __all__ = ["LENGTHS", "allan_surface", "score", "transfer"]
@@ -65,12 +65,12 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        See `gyrostab.diagnose.statistics.scores.view_dataset`.
+        See `gyrostab.diagnose.statistics.scores.statistic_dataset`.
     """
     surface = allan_surface(reduced, baseline)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = surface["observed"] / surface["expected"]
-    return view_dataset(
+    return statistic_dataset(
         "davar",
         reduced,
         windows=surface["windows"],
@@ -93,7 +93,7 @@ def allan_surface(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows | 
     Returns
     -------
     dict
-        ``observed``, ``expected``, ``shape``; ``windows``; ``columns`` as for `view_dataset`.
+        ``observed``, ``expected``, ``shape``; ``windows``; ``columns`` as for `statistic_dataset`.
     """
     windows = window_set(reduced.sizes["block"], LENGTHS) if windows is None else windows
     parts = [_inside(reduced, baseline, windows), _beyond(reduced, baseline, windows)]

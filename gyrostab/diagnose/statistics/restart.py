@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.statistics.mean import MeanNoise, mean_noise, precision
-from gyrostab.diagnose.statistics.scores import Array, Windows, values_of, view_dataset
+from gyrostab.diagnose.statistics.scores import Array, Windows, statistic_dataset, values_of
 
 __all__ = ["score"]
 
@@ -50,7 +50,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     size = spread.copy()
     spread[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = z, estimate
     tau = np.array([*_TIMES, _BESIDE], dtype=float) * block
-    return view_dataset(
+    return statistic_dataset(
         "restart",
         reduced,
         windows=windows,

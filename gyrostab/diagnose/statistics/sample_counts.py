@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.evidence.sample_counts import OF_LATTICE, beyond_ends, coarse_lattice
-from gyrostab.diagnose.statistics.scores import Array, over_windows, values_of, view_dataset, window_set
+from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, beyond_ends, has_coarse_grid
+from gyrostab.diagnose.statistics.scores import Array, over_windows, statistic_dataset, values_of, window_set
 
 __all__ = ["COUNTS", "LENGTHS", "score"]
 
@@ -34,7 +34,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        See `gyrostab.diagnose.statistics.scores.view_dataset`. ``ratio`` and ``estimate`` are the count, or the mean kurtosis.
+        See `gyrostab.diagnose.statistics.scores.statistic_dataset`. ``ratio`` and ``estimate`` are the count, or the mean kurtosis.
     """
     windows = window_set(reduced.sizes["block"], LENGTHS)
     samples = values_of(reduced, "samples", "axis", "block").astype(float)
@@ -52,9 +52,9 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     rate = float(reduced.attrs["sampling_rate_hz"])
     number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
     z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
-    of_lattice = np.array([name in OF_LATTICE for name in (*COUNTS, "kurtosis")])
-    z = np.where(coarse_lattice(reduced)[:, None, None] & of_lattice, np.nan, z)
-    return view_dataset(
+    of_lattice = np.array([name in GRID_COUNTS for name in (*COUNTS, "kurtosis")])
+    z = np.where(has_coarse_grid(reduced)[:, None, None] & of_lattice, np.nan, z)
+    return statistic_dataset(
         "distribution",
         reduced,
         windows=windows,

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtri_exp
 
-__all__ = ["Array", "Windows", "cube_root_score", "exponential_score", "over_windows", "values_of", "view_dataset", "window_set"]
+__all__ = ["Array", "Windows", "cube_root_score", "exponential_score", "over_windows", "statistic_dataset", "values_of", "window_set"]
 
 Array = NDArray[np.float64]
 #: A window moves by this share of its length, in records up to so many blocks, and in longer ones.
@@ -106,7 +106,7 @@ def values_of(reduced: xr.Dataset, name: str, *dims: str) -> Any:
     return reduced[name].transpose(..., *dims).values
 
 
-def view_dataset(
+def statistic_dataset(
     name: str,
     reduced: xr.Dataset,
     *,

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, values_of, view_dataset
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of
 
 __all__ = ["score"]
 
@@ -49,7 +49,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     excess = _near(flat - around) * expected if flat.ndim == 3 else np.zeros(1)
     z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND)))
     half = 0.371 / frequency  # where the Allan variance of a sine is largest
-    return view_dataset(
+    return statistic_dataset(
         "spectrum",
         reduced,
         windows=windows,

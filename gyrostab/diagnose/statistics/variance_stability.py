@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, values_of, view_dataset, window_set
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of, window_set
 
 __all__ = ["LENGTHS", "SPANS", "levelled", "scatter_moments", "score"]
 
@@ -65,7 +65,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     z, ratio, swing = (np.concatenate([one[place] for one in found], axis=-1) for place in range(3))
     f_low = np.append([low[used][one].min() for one in members], low[used][0])
     f_high = np.append([high[used][one].max() for one in members], high[used][-1])
-    return view_dataset(
+    return statistic_dataset(
         "davar",
         reduced,
         rows=rows,

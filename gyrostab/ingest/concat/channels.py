@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
 from gyrostab.ingest.concat.grid import Piece
-from gyrostab.ingest.concat.lazy import Part, fill_parts, lay
+from gyrostab.ingest.concat.lazy import Part, fill_parts, place_on_grid
 from gyrostab.schema import log_channels
 from gyrostab.store.direct import can_fill, with_fill
 from gyrostab.time.grid import grid_index, grid_times
@@ -47,7 +47,11 @@ def join_channels(pieces: Sequence[Piece], start: int, rate: float, size: int, c
             variables[name] = (f"time_{name}", values, attributes)
             coordinates[f"time_{name}"] = stamps.view("datetime64[ns]")
         else:
-            variables[name] = ("time", lay([[_on_time(piece, name, start, rate) for piece in holders]], size, chunk, flat=True), attributes)
+            variables[name] = (
+                "time",
+                place_on_grid([[_on_time(piece, name, start, rate) for piece in holders]], size, chunk, flat=True),
+                attributes,
+            )
     return variables, coordinates
 
 

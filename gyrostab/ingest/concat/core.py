@@ -15,7 +15,7 @@ from gyrostab.ingest.concat.axes import group_axes
 from gyrostab.ingest.concat.channels import join_channels
 from gyrostab.ingest.concat.gaps import join_gaps
 from gyrostab.ingest.concat.grid import Piece, Source, log_span, source_of
-from gyrostab.ingest.concat.lazy import chunk_of, lay
+from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
 from gyrostab.ingest.concat.notes import some, together
 from gyrostab.ingest.concat.place import place_logs
 from gyrostab.ingest.gap_table import gap_variables, name_lost, stamp_text
@@ -26,7 +26,7 @@ from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_times, time_coordinate
 
-__all__ = ["join_logs", "log_span"]
+__all__ = ["concatenate_logs", "log_span"]
 
 #: Share of a log without an axis that other logs hold, from which a note says so; recorders are started one after the other.
 _NOTED_SHARE = 0.01
@@ -35,7 +35,7 @@ _NOTED_SHARE = 0.01
 RATE_TOLERANCE = 1e-4
 
 
-def join_logs(
+def concatenate_logs(
     logs: Sequence[xr.Dataset],
     paths: Sequence[str | Path],
     *,
@@ -96,7 +96,7 @@ def join_logs(
     chunk = chunk_of([source.log[name].data for source in sources])
     axes = sorted({axis for source in sources for axis in source.axes})
     signal = xr.Variable(
-        ("axis", "time"), lay([_parts(pieces, name, axis) for axis in axes], size, chunk), _signal_attributes(sources, name)
+        ("axis", "time"), place_on_grid([_parts(pieces, name, axis) for axis in axes], size, chunk), _signal_attributes(sources, name)
     )
     signal.encoding = common_packing(source.log[name].encoding for source in sources)
     channels, stamps = join_channels(pieces, start, rate, size, chunk)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gyrostab.store.direct import can_fill, fill_row, with_fill
 
-__all__ = ["Part", "chunk_of", "fill_parts", "lay"]
+__all__ = ["Part", "chunk_of", "fill_parts", "place_on_grid"]
 
 #: An array (time), or (axis, time) with the row to take, and its runs: first sample of the grid, first of the array, length.
 Part = tuple[Any, int | None, NDArray[np.int64]]
@@ -77,7 +77,7 @@ class _Row:
         return found
 
 
-def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = False) -> Any:
+def place_on_grid(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = False) -> Any:
     """Put arrays on one grid, float64, NaN where none has a sample; where two have one, the first of them that is not NaN counts.
 
     Parameters
@@ -129,7 +129,7 @@ def lay(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = F
 
 
 def fill_parts(rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]) -> None:
-    """Samples of one row from `begin` on, as the tasks of `lay` make them."""
+    """Samples of one row from `begin` on, as the tasks of `place_on_grid` make them."""
     found = [(number, *one) for number, part in enumerate(rows[row]) for one in _reaching(part, begin, begin + out.size)]
     ends = sorted((at, at + length) for *_, at, length in found)
     if any(stop > start for (_, stop), (start, _) in pairwise(ends)):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import xarray as xr
 
-from gyrostab.ingest.concat import join_logs, some, split_axes
+from gyrostab.ingest.concat import concatenate_logs, some, split_axes
 from gyrostab.schema import texts
 from gyrostab.time.grid import first_stamp
 
@@ -29,7 +29,7 @@ def regularise_axes(
     regularise : callable
         Makes a regular log of one group.
     max_gap, limits
-        As for `gyrostab.ingest.concat.join_logs`.
+        As for `gyrostab.ingest.concat.concatenate_logs`.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def regularise_axes(
     labels = [some(texts(part, "source_files")) for part in parts]
     if len(set(labels)) < len(labels):
         labels = [f"{label} ({', '.join(axes)})" for label, (axes, _, _) in zip(labels, raw.attrs["axis_rows"], strict=True)]
-    log = join_logs(logs, labels, max_gap=max_gap, limits=limits)
+    log = concatenate_logs(logs, labels, max_gap=max_gap, limits=limits)
     starts = [first_stamp(each) for each in logs]
     held = []
     for label, start, (axes, _, _) in zip(labels, starts, raw.attrs["axis_rows"], strict=True):

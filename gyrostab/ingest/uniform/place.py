@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.ingest.concat.lazy import chunk_of, lay
+from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
 from gyrostab.schema import texts
 from gyrostab.store.direct import held
 from gyrostab.time.grid import time_coordinate
@@ -70,4 +70,4 @@ def _place_array(array: Any, runs: Runs, size: int) -> Any:
         return out
     lazy = held(array, CHUNK_SAMPLES) if isinstance(array, np.ndarray) else array
     rows = [[(lazy, None, runs)]] if array.ndim == 1 else [[(lazy, row, runs)] for row in range(array.shape[0])]
-    return lay(rows, size, chunk_of([lazy]), flat=array.ndim == 1)
+    return place_on_grid(rows, size, chunk_of([lazy]), flat=array.ndim == 1)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate, from_model, from_simulation
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model, baseline_from_simulation, calibrate_noise
 from gyrostab.diagnose.baseline.expected_statistics import common_variance, noise_powers, white_variance
 from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
-from gyrostab.diagnose.baseline.quiescent import quiet_blocks
+from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics.power import allan_surface
@@ -53,7 +53,7 @@ def test_expected_powers_are_those_of_simulated_noise(term, size):
 def test_coefficients_lie_within_their_errors(lost):
     noise = {"Q": 0.5, "N": 0.003, "B": 0.004, "K": 0.1}
     axes = tuple("abcdefghijkl")
-    baseline = calibrate(reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3)))
+    baseline = calibrate_noise(reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3)))
     for term, value in noise.items():
         z = ((baseline["coefficient"] - value) / baseline["stderr"]).sel(term=term).values
         assert (np.abs(z) < 2.0).mean() > 0.7, term
@@ -86,7 +86,7 @@ def test_powers_of_a_block_scatter_together_as_told():
 def test_shaken_turning_and_warming_blocks_are_not_quiet():
     warm = {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 30], [2700, 30], [3600, 60]]}
     reduced = reduce_log(log(environment=[SHAKEN, warm], duration="1h"))
-    quiet, reason = quiet_blocks(reduced)
+    quiet, reason = find_quiescent_blocks(reduced)
     middle = ((reduced["begin"] + reduced["end"]) / 2.0).values
     assert not quiet[0, (middle > 1210) & (middle < 1490)].any()
     assert not quiet[0, middle > 2900].any()
@@ -98,7 +98,7 @@ def test_shaken_turning_and_warming_blocks_are_not_quiet():
 def test_a_loud_stretch_without_a_channel_is_not_calibrated_on():
     effect = {"name": "vibration_noise", "white": 0.0006, "driver": "vibration"}
     loud = reduce_log(log(effects=[effect], environment=[SHAKEN], rate=100.0)).drop_vars("channel_vibration")
-    baseline = calibrate(loud)
+    baseline = calibrate_noise(loud)
     middle = ((loud["begin"] + loud["end"]) / 2.0).values
     inside = (middle > 1220) & (middle < 1480)
     assert not baseline["quiet"].values[0, inside].any()
@@ -112,17 +112,19 @@ def test_quiet_time_is_taken_as_named_and_checked():
     reduced = reduce_log(log(rate=10.0))
     begin, end = reduced["begin"].values, reduced["end"].values
     for quiet in ((0.0, 1200.0), ("1970-01-01T00:00:00Z", "1970-01-01T00:20:00Z"), end <= 1200.0):
-        chosen = calibrate(reduced, quiet=quiet)["quiet"].values[0]
+        chosen = calibrate_noise(reduced, quiet=quiet)["quiet"].values[0]
         np.testing.assert_array_equal(chosen, (begin >= 0.0) & (end <= 1200.0))
-    assert calibrate(reduced, quiet=(0.0, 1200.0)).attrs["calibrated_on"] == [["1970-01-01T00:00:00.000Z", "1970-01-01T00:20:00.000Z"]]
+    assert calibrate_noise(reduced, quiet=(0.0, 1200.0)).attrs["calibrated_on"] == [
+        ["1970-01-01T00:00:00.000Z", "1970-01-01T00:20:00.000Z"]
+    ]
     with pytest.raises(OptionError, match=r"quiet holds 0 whole blocks of 20 s, 0 samples; .* name 40 s or more within the 3600 s"):
-        calibrate(reduced, quiet=(0.0, 15.0))
+        calibrate_noise(reduced, quiet=(0.0, 15.0))
     with pytest.raises(OptionError, match="'soon' is not a date and time"):
-        calibrate(reduced, quiet=("soon", "later"))
+        calibrate_noise(reduced, quiet=("soon", "later"))
 
 
 def test_the_grid_holds_calibrated_and_far_redder_noise():
-    baseline = calibrate(reduce_log(log({"N": 0.003, "K": 0.3})))
+    baseline = calibrate_noise(reduce_log(log({"N": 0.003, "K": 0.3})))
     K, weight = baseline["grid_K"].values[0], np.exp(baseline["grid_calibrated"].values[0])
     assert weight.sum() == pytest.approx(1.0)
     assert weight[(K > 0.1) & (K < 0.9)].sum() > 0.9
@@ -141,7 +143,7 @@ def test_a_model_is_taken_with_its_effects():
     model = {"noise": {"N": 0.003, "R": 0.1}, "effect": effects, "environment": [SHAKEN, warm], "log": {"axes": ["x", "y"]}}
     made = simulate({**model, "effect": effects[:2]}, duration="1h", rate=10.0, seed=4).compute()
     reduced = reduce_log(made)
-    baseline = from_model(reduced, model)
+    baseline = baseline_from_model(reduced, model)
     ratio = reduced["power"] / baseline["spectrum"]
     shaken = (reduced["begin"].values > 1200) & (reduced["end"].values < 1500)
     assert float(ratio.isel(block=shaken).mean()) == pytest.approx(1.0, abs=0.1)
@@ -155,15 +157,15 @@ def test_a_model_is_taken_with_its_effects():
     nulls = next(iter(null_records(reduced, baseline, count=3, rng=np.random.default_rng(1))))
     assert float((nulls["mean"] - baseline["known_mean"]).std()) < 2.0 * float(np.sqrt(baseline["mean_variance"].mean()))
     with pytest.raises(SchemaError, match="temperature"):
-        from_model(reduced.drop_vars("channel_temperature"), model)
+        baseline_from_model(reduced.drop_vars("channel_temperature"), model)
     with pytest.raises(OptionError, match="no noise"):
-        from_model(reduced, {"noise": {"z": {"N": 1.0}}})
+        baseline_from_model(reduced, {"noise": {"z": {"N": 1.0}}})
 
 
 def test_a_ramp_of_a_model_is_expected_once():
     noise = {"N": 0.003, "R": 2.0}
     reduced = reduce_log(log(noise))
-    surface = allan_surface(reduced, from_model(reduced, {"noise": noise}))
+    surface = allan_surface(reduced, baseline_from_model(reduced, {"noise": noise}))
     score = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])
     assert np.nanmax(np.abs(score[0, -1])) < 4.0  # the record as one window
 
@@ -175,7 +177,7 @@ def test_a_filter_of_a_model_is_seen_through_random_gaps():
         "log": {"axes": ["x"]},
     }
     reduced = reduce_log(log({"N": 0.003}, effects=model["effect"], lost=0.3))
-    ratio = (reduced["power"] / from_model(reduced, model)["spectrum"]).mean("block")
+    ratio = (reduced["power"] / baseline_from_model(reduced, model)["spectrum"]).mean("block")
     error = 1.0 / np.sqrt(reduced["shape"].sum("block"))
     assert float(np.abs((ratio - 1.0) / error).max()) < 4.5
 
@@ -184,7 +186,7 @@ def test_a_simulation_is_calibrated_and_keeps_its_level():
     effect = {"name": "vibration_noise", "white": 0.002}
     recording = reduce_log(log(effects=[effect], environment=[SHAKEN], seed=1))
     simulated = reduce_log(log(effects=[effect], environment=[SHAKEN], seed=2))
-    baseline = from_simulation(recording, simulated)
+    baseline = baseline_from_simulation(recording, simulated)
     shaken = (recording["begin"].values > 1220) & (recording["end"].values < 1480)
     still = (recording["end"].values < 1000) | (recording["begin"].values > 1700)
     ratio = recording["power"] / baseline["spectrum"]
@@ -192,14 +194,14 @@ def test_a_simulation_is_calibrated_and_keeps_its_level():
     assert float(ratio.isel(block=still).mean()) == pytest.approx(1.0, abs=0.05)
     assert baseline.attrs["source"] == "simulation"
     with pytest.raises(SchemaError, match="--like"):
-        from_simulation(recording, reduce_log(log(rate=20.0)))
+        baseline_from_simulation(recording, reduce_log(log(rate=20.0)))
 
 
 def test_an_axis_without_spectra_is_named():
     reduced = reduce_log(log(axes=("x", "y")))
     reduced["power"].loc[{"axis": "y"}] = np.nan
     with pytest.raises(SchemaError, match="axis y"):
-        calibrate(reduced)
+        calibrate_noise(reduced)
 
 
 def test_noise_is_fitted_where_the_likelihood_is_largest_also_where_no_sum_of_terms_fits():

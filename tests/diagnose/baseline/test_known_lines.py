@@ -9,9 +9,9 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import from_model
-from gyrostab.diagnose.baseline.known_effects import without_known_lines
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_gains
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model
+from gyrostab.diagnose.baseline.known_effects import remove_known_lines
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics.spectral_line import score
@@ -33,7 +33,7 @@ def log_of(seed: int, size: float) -> xr.Dataset:
 
 def gain(reduced: xr.Dataset, baseline: xr.Dataset) -> float:
     expected = expected_lines(baseline, reduced["line_frequency"].values)
-    return float(line_gains(reduced["line_power"].values[None], reduced["line_weight"].values, expected).max())
+    return float(line_evidence(reduced["line_power"].values[None], reduced["line_weight"].values, expected).max())
 
 
 @pytest.mark.parametrize("amplitude", [0.03, 0.3, 3.0])
@@ -42,24 +42,24 @@ def test_a_known_line_is_gone_wherever_it_lies_between_ordinates(amplitude, freq
     line = {"name": "spectral_line", "amplitude": amplitude, "frequency": frequency}
     made = {"noise": NOISE, "effect": [line], "log": {"axes": ["x"]}}
     reduced = reduce_log(simulate(made, duration="30min", rate=10.0, seed=7).compute())
-    baseline = from_model(reduced, made)
-    freed = without_known_lines(reduced, baseline)
+    baseline = baseline_from_model(reduced, made)
+    freed = remove_known_lines(reduced, baseline)
     assert gain(freed, baseline) < 6.0
     assert float(np.nanmax(score(freed, baseline)["z"])) < 5.0
     if amplitude > 0.1:
-        assert gain(reduced, from_model(reduced, model(0.0) | {"log": {"axes": ["x"]}})) > 50.0
+        assert gain(reduced, baseline_from_model(reduced, model(0.0) | {"log": {"axes": ["x"]}})) > 50.0
 
 
 def test_a_line_that_is_a_little_off_the_model_is_not_told_and_a_stronger_one_is():
-    baseline = from_model(reduce_log(log_of(1, SIZE)), model(SIZE))
-    assert gain(without_known_lines(reduce_log(log_of(1, 1.03 * SIZE)), baseline), baseline) < 6.0
-    assert gain(without_known_lines(reduce_log(log_of(1, 1.5 * SIZE)), baseline), baseline) > 20.0
+    baseline = baseline_from_model(reduce_log(log_of(1, SIZE)), model(SIZE))
+    assert gain(remove_known_lines(reduce_log(log_of(1, 1.03 * SIZE)), baseline), baseline) < 6.0
+    assert gain(remove_known_lines(reduce_log(log_of(1, 1.5 * SIZE)), baseline), baseline) > 20.0
 
 
 def test_null_records_have_the_peaks_of_the_model():
     made = model(0.5, quality=30.0)
     reduced = reduce_log(simulate(made, duration="1h", rate=10.0, seed=2).compute())
-    baseline = from_model(reduced, made)
+    baseline = baseline_from_model(reduced, made)
     nulls = next(iter(null_records(reduced, baseline, count=25, rng=np.random.default_rng(1))))
     drawn = nulls["line_power"].isel(axis=0).mean(["record", "part"])
     seen = reduced["line_power"].isel(axis=0).mean("part")

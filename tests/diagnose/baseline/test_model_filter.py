@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
@@ -27,7 +27,7 @@ def made(**filtering: float) -> dict[str, object]:
 def test_a_model_expects_its_own_filter(filtering):
     model = made(**filtering)
     reduced = reduce_log(simulate(model, duration="1h", rate=10.0, seed=3).compute())
-    expected = from_model(reduced, model)["spectrum"]
+    expected = baseline_from_model(reduced, model)["spectrum"]
     ratio = (reduced["power"] / expected).mean(["axis", "block"]).values
     error = 1.0 / np.sqrt(reduced["shape"].sum(["axis", "block"]).values)
     assert np.abs((ratio - 1.0) / error).max() < 4.5

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate, from_model
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model, calibrate_noise
 from gyrostab.diagnose.baseline.quantization_grid import angle_share, rounded_rates
-from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.identify.forward_search import name_effects
-from gyrostab.diagnose.identify.identifiability import structural
+from gyrostab.diagnose.identify.identifiability import find_equivalent_effects
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import begin_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.zero_bin import cut_off, may_be_cut_off
@@ -41,14 +41,14 @@ def test_steps_are_told_apart(steps: float, mean: float) -> None:
     for kind, expected in (("rate", True), ("angle", False)):
         reduced = on_lattice(kind, steps, mean=mean)
         np.testing.assert_allclose(reduced["lattice"], steps * SCATTER, rtol=1e-6)
-        assert (rounded_rates(reduced, calibrate(reduced)) == expected).all(), kind
+        assert (rounded_rates(reduced, calibrate_noise(reduced)) == expected).all(), kind
 
 
 @pytest.mark.parametrize("kind", ["rate", "angle"])
 def test_fine_steps_are_nobodys(kind: str) -> None:
     reduced = on_lattice(kind, 0.3)
     assert (reduced["lattice"] > 0).all()
-    assert not rounded_rates(reduced, calibrate(reduced)).any()
+    assert not rounded_rates(reduced, calibrate_noise(reduced)).any()
 
 
 def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
@@ -59,12 +59,12 @@ def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
     counted = np.diff(np.floor(np.cumsum(smooth, axis=1) / step), axis=1, prepend=0.0) * step
     reduced = reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
     assert (reduced["lattice"] > 0).all()
-    assert not rounded_rates(reduced, calibrate(reduced)).any()
+    assert not rounded_rates(reduced, calibrate_noise(reduced)).any()
 
 
 def test_axes_tell_together_what_one_tells_not() -> None:
     reduced = on_lattice("rate", 0.7)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     alone = [rounded_rates(reduced.isel(axis=[number]), baseline.isel(axis=[number])) for number in range(2)]
     assert not np.concatenate(alone).any()
     assert rounded_rates(reduced, baseline).all()
@@ -73,14 +73,14 @@ def test_axes_tell_together_what_one_tells_not() -> None:
 def test_without_a_lattice_nothing_was_rounded() -> None:
     reduced = on_lattice("rate", 2.0)
     plain = reduced.assign(lattice=reduced["lattice"] * 0.0)
-    assert not rounded_rates(plain, calibrate(reduced)).any()
+    assert not rounded_rates(plain, calibrate_noise(reduced)).any()
 
 
 def test_a_model_does_not_say_what_the_record_is() -> None:
     model = {"noise": {"N": 0.003, "Q": 0.1}, "log": {"axes": ["x", "y"]}}
     for kind, expected in (("rate", True), ("angle", False)):
         reduced = on_lattice(kind, 2.0)
-        assert (rounded_rates(reduced, from_model(reduced, model)) == expected).all()
+        assert (rounded_rates(reduced, baseline_from_model(reduced, model)) == expected).all()
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.13, 0.5])
@@ -116,7 +116,7 @@ def test_a_rate_that_is_cut_off_towards_zero_is_told_by_the_cell_of_zero(step: f
         assert (may_be_cut_off(reduced) == cut).all()
         width, error = reduced["cell_width"].values, reduced["cell_width_stderr"].values
         assert (np.abs(width - [2.0 if cut else 1.0, 1.0]) < 4.0 * error + 0.15).all()
-        assert rounded_rates(reduced, calibrate(reduced)).all() == cut or step > 0.4
+        assert rounded_rates(reduced, calibrate_noise(reduced)).all() == cut or step > 0.4
 
 
 @pytest.mark.parametrize("zone", [1.0, 2.0])
@@ -138,7 +138,7 @@ def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(how, zone: float
     assert [claim.effect for claim in found.claims] == names
     assert all(claim.alternatives == () for claim in found.claims)
     if names == ["rate_quantization"]:
-        assert {one.effect.mode for one in fit_claims(found, baseline) if one.effect} == {"zero"}
+        assert {one.effect.mode for one in fit_identifications(found, baseline) if one.effect} == {"zero"}
 
 
 def test_where_the_cells_do_not_tell_both_names_stand() -> None:
@@ -147,8 +147,8 @@ def test_where_the_cells_do_not_tell_both_names_stand() -> None:
     assert may_be_cut_off(reduced).all()
     assert not cut_off(reduced).any()
     variant = Variant({}, ("stuck",), np.empty(0))
-    part = Part(Candidate("dead_zone", "marks", (), (variant,)), variant, ("x",), 20.0)
-    state = begin_state(reduced, calibrate(reduced))
-    assert "rate_quantization" in structural("dead_zone", [part], state)
+    part = Component(Candidate("dead_zone", "marks", (), (variant,)), variant, ("x",), 20.0)
+    state = begin_state(reduced, calibrate_noise(reduced))
+    assert "rate_quantization" in find_equivalent_effects("dead_zone", [part], state)
     told = cut_record(np.rint, zone=1.0, size=15_000)
-    assert "rate_quantization" not in structural("dead_zone", [part], begin_state(told, calibrate(told)))
+    assert "rate_quantization" not in find_equivalent_effects("dead_zone", [part], begin_state(told, calibrate_noise(told)))

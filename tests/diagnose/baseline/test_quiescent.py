@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import calibrate, from_model, from_simulation
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model, baseline_from_simulation, calibrate_noise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from tests.diagnose.baseline.test_calibrate import NOISE, SHAKEN, log
 
@@ -22,7 +22,7 @@ def test_a_short_quiet_stretch_calibrates_with_a_note_on_its_precision(blocks):
     reduced = reduce_log(log({"N": 0.003}, duration="30min"))
     step = reduced.attrs["block_s"]
     with pytest.warns(UserWarning, match=rf"holds {blocks} blocks? of {step:g} s: N is known to \d"):
-        baseline = calibrate(reduced, quiet=(0.0, blocks * step + 1.0))
+        baseline = calibrate_noise(reduced, quiet=(0.0, blocks * step + 1.0))
     value, error = value_of(baseline, "N")
     assert 0.0 < error < 0.25 * value
     assert abs(value - 0.003) < 4.0 * error
@@ -34,7 +34,7 @@ def test_the_error_of_a_short_calibration_covers_the_truth():
     for seed in range(8):
         reduced = reduce_log(log({"N": 0.003}, seed=seed, duration="20min"))
         with pytest.warns(UserWarning, match="N is known to"):
-            value, error = value_of(calibrate(reduced, quiet=(0.0, 45.0)), "N")
+            value, error = value_of(calibrate_noise(reduced, quiet=(0.0, 45.0)), "N")
         pulls.append((value - 0.003) / error)
     assert np.abs(pulls).max() < 4.0
 
@@ -44,7 +44,7 @@ def test_a_model_gives_the_proportions_and_quiet_time_the_level():
     recording = log(effects=[SHAKE_NOISE], environment=[SHAKEN])
     reduced = reduce_log(recording)
     model = {"noise": {name: 0.8 * size for name, size in NOISE.items()}, "effect": [SHAKE_NOISE]}
-    raw, scaled = from_model(reduced, model), from_model(reduced, model, quiet=(0.0, 1100.0))
+    raw, scaled = baseline_from_model(reduced, model), baseline_from_model(reduced, model, quiet=(0.0, 1100.0))
     assert value_of(raw, "N") == (pytest.approx(0.0024), 0.0)
     for term, size in NOISE.items():
         value, error = value_of(scaled, term)
@@ -65,14 +65,14 @@ def test_quiet_time_calibrates_beside_an_effect_that_acts_in_it():
     shaken = {"profile": "vibration", "points": [[0, 6.0], [3600, 6.0]]}
     reduced = reduce_log(log(effects=[SHAKE_NOISE], environment=[shaken]))
     model = {"noise": {name: 0.8 * size for name, size in NOISE.items()}, "effect": [SHAKE_NOISE]}
-    value, error = value_of(from_model(reduced, model, quiet=(0.0, 1800.0)), "N")
+    value, error = value_of(baseline_from_model(reduced, model, quiet=(0.0, 1800.0)), "N")
     assert abs(value - 0.003) < 4.0 * error
     assert error < 0.15 * value
 
 
 def test_a_simulated_log_is_scaled_to_quiet_time():
     reduced, simulated = reduce_log(log(seed=1)), reduce_log(log({name: 0.8 * size for name, size in NOISE.items()}, seed=2))
-    plain, scaled = from_simulation(reduced, simulated), from_simulation(reduced, simulated, quiet=(0.0, 1800.0))
+    plain, scaled = baseline_from_simulation(reduced, simulated), baseline_from_simulation(reduced, simulated, quiet=(0.0, 1800.0))
     assert abs(value_of(plain, "N")[0] - 0.0024) < 1e-4
     value, error = value_of(scaled, "N")
     assert abs(value - 0.003) < 4.0 * error

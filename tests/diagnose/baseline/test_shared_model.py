@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
@@ -37,7 +37,7 @@ def lossy(log: xr.Dataset, share: float) -> xr.Dataset:
 def test_null_records_share_what_the_model_says(lost):
     size = 0.0025
     records = [reduce_log(lossy(log_of(seed, size, minutes=60), lost)) for seed in range(1, 5)]
-    baseline = from_model(records[0], {"noise": NOISE, "effect": [shared(size)]})
+    baseline = baseline_from_model(records[0], {"noise": NOISE, "effect": [shared(size)]})
     pieces = list(null_records(records[0], baseline, count=40, rng=np.random.default_rng(1)))
     nulls = xr.concat(pieces, "record", data_vars="minimal", coords="minimal", compat="override", join="override")
     raw = xr.concat([one[["cross", "power", "mean"]] for one in records], "record", coords="minimal", compat="override", join="override")
@@ -67,7 +67,7 @@ def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
     sway = {"name": "real_motion", "direction": [1.0, -0.5, 0.0], "sway": 0.5, "frequency": 0.4}
     model = {"noise": NOISE, "effect": [line, sway], "log": {"axes": ["x", "y", "z"]}}
     reduced = reduce_log(simulate(model, duration="1h", rate=10.0, seed=3).compute())
-    baseline = from_model(reduced, model)
+    baseline = baseline_from_model(reduced, model)
     for frequency in (1.3, 0.4):
         band = int(np.flatnonzero((reduced["band_low"] <= frequency) & (frequency < reduced["band_high"]))[0])
         seen, expected = (one["cross"].isel(band=band).mean("block").values for one in (reduced, baseline))

@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.baseline.known_effects import known_motion, without_known_motion
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.task import Task, still_lines
 from gyrostab.progress import no_stage
@@ -68,7 +68,7 @@ def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
     """The core reads the log again for its lines; what is loud in blocks that are left out does not matter then."""
     task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
     reduced = reduce_log(jumped)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     course = np.zeros((1, reduced.sizes["block"]))
     course[:, :12:2] = 5.0  # the first part has the blocks 0 to 11
     known = baseline.assign(known_mean=(("axis", "block"), course))
@@ -85,9 +85,9 @@ def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_
     step = np.zeros((3, reduced.sizes["block"]))
     step[1, 90:] = 1.0
     known = baseline.assign(known_mean=(("axis", "block"), step))
-    moving = known_motion(reduced, known)
+    moving = expect_known_motion(reduced, known)
     assert np.argwhere(moving).tolist() == [[1, 89], [1, 90]]
-    out = without_known_motion(reduced, known)
+    out = remove_known_motion(reduced, known)
     for name in ("power", "kurtosis"):
         lost = out[name].isnull() & reduced[name].notnull()
         lost = lost.any("band") if "band" in lost.dims else lost
@@ -96,4 +96,4 @@ def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_
     touched = ["y" in pair for pair in zip(reduced["first"].values, reduced["second"].values, strict=True)]
     np.testing.assert_array_equal(lost, np.outer(touched, moving[1]))
     xr.testing.assert_identical(out["mean"], reduced["mean"])
-    assert without_known_motion(reduced, baseline) is reduced
+    assert remove_known_motion(reduced, baseline) is reduced

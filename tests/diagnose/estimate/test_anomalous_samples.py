@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predicted
-from gyrostab.diagnose.estimate.joint_fit import fit_claims
-from gyrostab.diagnose.estimate.outlier_power import with_odd_power
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
+from gyrostab.diagnose.estimate.outlier_power import add_outlier_power
 from gyrostab.diagnose.estimate.recalibrate import recalibrate
-from gyrostab.diagnose.identify.forward_search import Naming, name_effects
+from gyrostab.diagnose.identify.forward_search import Identifications, name_effects
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.ingest.make_log import make_log
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SCATTER = 0.5  # deg/h, of a sample
 
 
-def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -> Naming:
+def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -> Identifications:
     noise = mean + SCATTER * np.random.default_rng(seed).standard_normal((len(axes), 15_000))
     effect = make_effect(table)
     on = [axes.index(axis) for axis in effect.axes or axes]
@@ -56,7 +56,7 @@ def test_it_is_told_where_they_stand(table, options):
     alone = table["name"] == "dead_zone" and options
     assert claim.alternatives == (("held_samples",) if alone else ())
     if table["name"] == "held_samples":
-        (fitted,) = fit_claims(found, calibrate(found.state.reduced))[:1]
+        (fitted,) = fit_identifications(found, calibrate_noise(found.state.reduced))[:1]
         assert fitted.effect is not None
         assert fitted.effect.fill == table.get("fill", "repeat")
 
@@ -132,7 +132,7 @@ def test_how_often_and_how_long_samples_were_held_is_told(fill):
         noise[:, first : first + length] = noise[:, first - 1 : first] if fill == "repeat" else 0.0
     reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
     baseline, records = nulls(reduced, 40)
-    found = fit_claims(name_effects(reduced, baseline, records), baseline)
+    found = fit_identifications(name_effects(reduced, baseline, records), baseline)
     assert [one.axes for one in found] == [("x",), ("y",), ("z",)]
     hours = float(reduced["samples"].sel(axis="x").sum()) / 36_000.0
     for one in found:
@@ -152,7 +152,7 @@ def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
     baseline, records = nulls(reduced, 40)
     (claim,) = (found := name_effects(reduced, baseline, records)).claims
     assert (claim.effect, claim.axes) == ("spikes", ("y",))
-    (fitted,) = fit_claims(found, baseline)
+    (fitted,) = fit_identifications(found, baseline)
     assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0
 
 
@@ -184,7 +184,7 @@ def test_spikes_of_six_deviations_are_named_and_counted():
     baseline, records = nulls(reduced, 40)
     (claim,) = (found := name_effects(reduced, baseline, records)).claims
     assert (claim.effect, claim.axes) == ("spikes", ("y",))
-    (fitted,) = fit_claims(found, baseline)
+    (fitted,) = fit_identifications(found, baseline)
     number = fitted.parameters["per_hour"].value * 15_000 / 36_000
     assert 10 < number < 40
     assert 0.5 < fitted.parameters["size"].value / (6.0 * SCATTER) < 2.0
@@ -197,12 +197,12 @@ def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_power
     reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
     assert (reduced["peaks"] > 0).mean() > 0.6
     baseline, records = nulls(reduced, 40)
-    (fitted,) = fit_claims(found := name_effects(reduced, baseline, records), baseline)
+    (fitted,) = fit_identifications(found := name_effects(reduced, baseline, records), baseline)
     size, number = fitted.parameters["size"], fitted.parameters["per_hour"]
     assert size.low < 70.0 * SCATTER < size.high
     assert number.low < 0.009 * 36_000 < number.high
     clean = predicted(found, recalibrate(found, baseline, [fitted]))
-    whole = with_odd_power(clean, reduced, [fitted])["spectrum"].mean()
+    whole = add_outlier_power(clean, reduced, [fitted])["spectrum"].mean()
     assert float(whole) == pytest.approx(float(reduced["power"].mean()), rel=0.4)
     assert float(clean["spectrum"].mean()) < 0.1 * float(whole)
     for lacking, known in (([fitted], []), ([], [fitted])):  # effects of the recording alone, or of the simulation too

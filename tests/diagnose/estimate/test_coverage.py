@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.estimate.joint_fit import fit_claims
-from gyrostab.diagnose.estimate.upper_limits import limits
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
+from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.nulls.records import null_records
-from gyrostab.diagnose.predict.condition import explain_away
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import begin_state
 from tests.diagnose.estimate.test_joint_fit import claimed
 from tests.support.named import WORLD, record
@@ -39,14 +39,14 @@ def slow(values: np.ndarray, time: float) -> np.ndarray:
 def fits(environment: tuple[dict[str, Any], ...], effect: str, column: str, shape: np.ndarray) -> list[dict[str, Any]]:
     """Numbers of an effect in records of noise to which its mean, of one value a second, is added."""
     reduced = record([], environment=environment)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     frame = claimed(reduced, baseline, effect, "mean", (column,))
     drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
     out = []
     for number in range(RECORDS):
         mean = drawn["mean"].isel(record=number).transpose("axis", "block") + in_blocks(shape)
-        state = explain_away(begin_state(reduced.assign(mean=mean), baseline), list(frame.claims[0].parts))
-        out.append(dict(fit_claims(replace(frame, state=state), baseline)[0].parameters))
+        state = condition_on(begin_state(reduced.assign(mean=mean), baseline), list(frame.claims[0].parts))
+        out.append(dict(fit_identifications(replace(frame, state=state), baseline)[0].parameters))
     return out
 
 
@@ -100,7 +100,7 @@ def test_what_is_there_but_slower_than_others_is_below_its_limit():
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
     environment = ({"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT}, WORLD["usual"][1])
     reduced = record([], environment=environment)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     frame = claimed(reduced, baseline, "shupe", "mean", ("sensitivity",))
     frame = replace(frame, claims=(), candidates=tuple(one for one in frame.candidates if one.effect == "shupe"))
     drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
@@ -108,6 +108,6 @@ def test_what_is_there_but_slower_than_others_is_below_its_limit():
     found = []
     for number in range(RECORDS):
         seen = reduced.assign(mean=drawn["mean"].isel(record=number).transpose("axis", "block") + there)
-        found.append(limits(replace(frame, state=begin_state(seen, baseline)))["shupe"].upper_limit)
+        found.append(find_upper_limits(replace(frame, state=begin_state(seen, baseline)))["shupe"].upper_limit)
     assert np.mean(np.array(found) >= size) >= 0.9
     assert np.median(found) < 4.0 * size

@@ -7,8 +7,8 @@ import pytest
 from scipy import signal
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import from_model
-from gyrostab.diagnose.baseline.known_effects import known_motion
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model
+from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.evidence.wandering import known_wander, mean_share
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -66,7 +66,7 @@ def reduced():
 def test_null_means_wander_as_the_model_does(reduced, memory, rms):
     """The covariance of block means is that of the double integral of the exponential memory."""
     effect = {"name": "gauss_markov", "rms": rms, "correlation_time": memory}
-    baseline = from_model(reduced, {"noise": {"N": 1e-5}, "effect": [effect]})
+    baseline = baseline_from_model(reduced, {"noise": {"N": 1e-5}, "effect": [effect]})
     drawn = np.concatenate([one["mean"].values[:, 0] for one in null_records(reduced, baseline, count=600, rng=np.random.default_rng(2))])
     a = float(reduced.attrs["block_s"]) / memory
     own, next_one = 2.0 * (a + np.expm1(-a)) / a**2, (np.expm1(-a) / a) ** 2
@@ -77,7 +77,7 @@ def test_null_means_wander_as_the_model_does(reduced, memory, rms):
 
 def test_null_means_walk_while_it_shakes(reduced):
     effect = {"name": "vibration_random_walk", "sensitivity": 0.3}
-    baseline = from_model(reduced, {"noise": {"N": 0.003}, "effect": [effect]})
+    baseline = baseline_from_model(reduced, {"noise": {"N": 0.003}, "effect": [effect]})
     nulls = np.concatenate([one["mean"].values[:, 0] for one in null_records(reduced, baseline, count=400, rng=np.random.default_rng(3))])
     begin, end = reduced["begin"].values, reduced["end"].values
     still, shaken = end <= 500.0, (begin >= 520.0) & (end <= 900.0)
@@ -91,8 +91,8 @@ def test_null_means_walk_while_it_shakes(reduced):
 
 
 def test_blocks_in_which_a_known_rate_moves_are_left_out(reduced):
-    baseline = from_model(reduced, {"noise": NOISE, "effect": [{"name": "scale_factor", "linear": 1000.0}]})
-    moving = known_motion(reduced, baseline)[0]
+    baseline = baseline_from_model(reduced, {"noise": NOISE, "effect": [{"name": "scale_factor", "linear": 1000.0}]})
+    moving = expect_known_motion(reduced, baseline)[0]
     begin, end = reduced["begin"].values, reduced["end"].values
     ramp = ((begin < 330.0) & (end > 300.0)) | ((begin < 830.0) & (end > 800.0))
     assert moving[ramp].all()
@@ -114,7 +114,7 @@ def test_a_narrow_resonance_is_expected_as_the_taper_shows_it(frequency, quality
     means = values[: values.size // 4 * 4].reshape(-1, 4).mean(axis=1)
     log = gyrostab.make_log(means[None], rate=rate, unit="deg/h")
     reduced = reduce_log(log, block="20s")
-    baseline = from_model(reduced, {"noise": {"N": 1e-4}, "effect": [effect]})
+    baseline = baseline_from_model(reduced, {"noise": {"N": 1e-4}, "effect": [effect]})
     seen, expected = reduced["power"].values[0].mean(axis=0), baseline["spectrum"].values[0].mean(axis=0)
     near = expected > 0.02 * expected.max()
     assert near.sum() >= 2

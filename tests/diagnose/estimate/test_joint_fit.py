@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predicted
-from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, fit_claims
-from gyrostab.diagnose.estimate.upper_limits import limits
+from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, fit_identifications
+from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.forward_search import Claim, Naming, name_effects
+from gyrostab.diagnose.identify.forward_search import Identification, Identifications, name_effects
 from gyrostab.diagnose.identify.sample_sizes import line_size
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import begin_state
 from gyrostab.simulate import simulate
 from tests.support.named import COEFFICIENT, nulls, record
@@ -28,18 +28,18 @@ RECORDS = 60
 @pytest.fixture(scope="module")
 def quiet():
     reduced = record([])
-    return reduced, calibrate(reduced)
+    return reduced, calibrate_noise(reduced)
 
 
-def claimed(reduced: xr.Dataset, baseline: xr.Dataset, effect: str, view: str, columns: tuple[str, ...]) -> Naming:
+def claimed(reduced: xr.Dataset, baseline: xr.Dataset, effect: str, view: str, columns: tuple[str, ...]) -> Identifications:
     """A naming of one effect on the first axis."""
     candidates, reasons = effect_candidates(reduced, COEFFICIENT)
     one = next(one for one in candidates if one.effect == effect and one.view == view)
     variant = next(variant for variant in one.variants if variant.columns == columns)
-    part = Part(one, variant, ("x",), 50.0)
-    claim = Claim(effect, one.driver, ("x",), (part,), 50.0, 8.0)
-    state = explain_away(begin_state(reduced, baseline), [part])
-    return Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced))
+    part = Component(one, variant, ("x",), 50.0)
+    claim = Identification(effect, one.driver, ("x",), (part,), 50.0, 8.0)
+    state = condition_on(begin_state(reduced, baseline), [part])
+    return Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced))
 
 
 def fits(quiet, change, effect, view, columns):
@@ -53,8 +53,8 @@ def fits(quiet, change, effect, view, columns):
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
         )
-        state = explain_away(begin_state(change(one), baseline), list(frame.claims[0].parts))
-        (fitted,) = fit_claims(replace(frame, state=state), baseline)
+        state = condition_on(begin_state(change(one), baseline), list(frame.claims[0].parts))
+        (fitted,) = fit_identifications(replace(frame, state=state), baseline)
         out.append(fitted.parameters[columns[0]])
     return out
 
@@ -101,7 +101,7 @@ def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
     one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
     one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
     frame = claimed(one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic"))
-    (fitted,) = fit_claims(frame, baseline)
+    (fitted,) = fit_identifications(frame, baseline)
     assert set(fitted.parameters) == ({"sensitivity", "quartic"} if both else {"sensitivity"})
     assert ("does not tell" in fitted.say()) is not both
     for name, truth in (("sensitivity", sensitivity), ("quartic", quartic)):
@@ -119,7 +119,7 @@ def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_fro
     shape = xr.DataArray(0.005 * g**2 if column == "sensitivity" else 1e-4 * g**4, dims="block")
     one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
     one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
-    (fitted,) = fit_claims(claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline)
+    (fitted,) = fit_identifications(claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline)
     alike = levels[0] == levels[1]
     assert set(fitted.parameters) == ({"sensitivity"} if alike else {column})
     assert ("does not tell" in fitted.say()) is alike
@@ -134,7 +134,7 @@ def shaken():
 
 def test_the_model_has_the_effect(shaken):
     naming, baseline = shaken
-    (fitted,) = fit_claims(naming, baseline)
+    (fitted,) = fit_identifications(naming, baseline)
     one = fitted.parameters["sensitivity"]
     assert one.low < 0.005 < one.high
     assert one.unit == "deg/h/g^2"
@@ -165,7 +165,7 @@ def test_the_prediction_fits_only_what_it_may_see(shaken):
 
 def test_what_was_not_found_has_a_limit_or_a_reason(shaken):
     naming, _ = shaken
-    found = limits(naming)
+    found = find_upper_limits(naming)
     assert "vibration_rectification" not in found
     assert found["shupe"].reason == "below limit"
     assert 0.0 < found["shupe"].upper_limit < 5.0
@@ -188,11 +188,11 @@ def test_size_of_a_line():
 def test_where_a_line_is_is_known_to_a_step_of_its_spectrum():
     true = 4.013
     reduced = record([{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}])
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     naming = claimed(reduced, baseline, "spectral_line", "line", ("amplitude",))
     place = int(reduced["line_power"].sel(axis="x").mean("part").values.argmax())
     part = replace(naming.claims[0].parts[0], place=place)
-    (fitted,) = fit_claims(replace(naming, claims=(replace(naming.claims[0], parts=(part,)),)), baseline)
+    (fitted,) = fit_identifications(replace(naming, claims=(replace(naming.claims[0], parts=(part,)),)), baseline)
     found = fitted.parameters["frequency"]
     step = float(np.diff(reduced["line_frequency"].values[:2])[0])
     assert found.low < true < found.high
@@ -201,7 +201,7 @@ def test_where_a_line_is_is_known_to_a_step_of_its_spectrum():
 
 def test_simulation_of_named_effects_runs(shaken):
     naming, baseline = shaken
-    (fitted,) = fit_claims(naming, baseline)
+    (fitted,) = fit_identifications(naming, baseline)
     values = {item.name: getattr(fitted.effect, item.name) for item in fitted.effect.parameters()}
     log = simulate(
         {"noise": {"N": 0.003}, "effect": [{"name": fitted.effect.name, "axes": ["y"], **values}],
@@ -217,13 +217,15 @@ def test_axes_that_the_strongest_view_lacks_have_their_sizes_from_the_next():
     truth = {"x": 0.2, "y": 0.3, "z": 0.1}
     effect = {"name": "aliased_vibration", "low": 700.0, "high": 800.0, "sensitivity": list(truth.values()), "axes": list(truth)}
     reduced = record([effect], environment=world)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     candidates, reasons = effect_candidates(reduced, baseline["coefficient"])
     power, cross = (next(one for one in candidates if (one.effect, one.view) == (effect["name"], view)) for view in ("power", "cross"))
-    parts = [Part(cross, cross.variants[0], ("x", "y"), 90.0), *(Part(power, power.variants[0], (axis,), 40.0) for axis in "yz")]
-    claim = Claim(effect["name"], power.driver, tuple(truth), tuple(parts), 130.0, 8.0)
-    state = explain_away(begin_state(reduced, baseline), parts)
-    (fitted,) = fit_claims(Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)), baseline)
+    parts = [Component(cross, cross.variants[0], ("x", "y"), 90.0), *(Component(power, power.variants[0], (axis,), 40.0) for axis in "yz")]
+    claim = Identification(effect["name"], power.driver, tuple(truth), tuple(parts), 130.0, 8.0)
+    state = condition_on(begin_state(reduced, baseline), parts)
+    (fitted,) = fit_identifications(
+        Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)), baseline
+    )
     assert fitted.effect.sensitivity == pytest.approx(tuple(fitted.parameters[f"sensitivity.{axis}"].value for axis in truth))
     for axis, size in truth.items():
         one = fitted.parameters[f"sensitivity.{axis}"]

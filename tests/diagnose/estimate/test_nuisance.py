@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.estimate.joint_fit import fit_claims
-from gyrostab.diagnose.predict.condition import explain_away
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import begin_state
 from gyrostab.physics.registry import make_effect
 from tests.diagnose.estimate.test_joint_fit import claimed
@@ -19,7 +19,7 @@ from tests.support.named import record
 @pytest.fixture(scope="module")
 def quiet():
     reduced = record([])
-    return reduced, calibrate(reduced)
+    return reduced, calibrate_noise(reduced)
 
 
 def _variant(naming, part, values):
@@ -43,8 +43,8 @@ def fitted(quiet, effect, view, column, *, true, size, named):
         seen = reduced.assign(power=reduced["power"] + size**2 * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]]))
     part = replace(part, variant=_variant(naming, part, named))
     claim = replace(naming.claims[0], parts=(part,))
-    state = explain_away(begin_state(seen, baseline), [part])
-    (found,) = fit_claims(replace(naming, claims=(claim,), state=state), baseline)
+    state = condition_on(begin_state(seen, baseline), [part])
+    (found,) = fit_identifications(replace(naming, claims=(claim,), state=state), baseline)
     return found
 
 

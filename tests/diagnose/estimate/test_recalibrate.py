@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predicted
-from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import Tallies
+from gyrostab.diagnose.predict.search import CountEvidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.simulate import simulate
@@ -40,10 +40,10 @@ def naming_of(reduced, baseline, effect, view, columns, **values):
     fits = [each for each in one.variants if each.columns == columns]
     variant = min(fits, key=lambda each: sum(abs(1.0 / (1.0 + each.values[name]) - 1.0 / (1.0 + size)) for name, size in values.items()))
     rows = [("x", "y")] if view == "cross" else [("x",)]
-    parts = tuple(Part(one, variant, row, 500.0) for row in rows)
-    claim = Claim(effect, one.driver, rows[0], parts, 500.0, 8.0)
-    state = explain_away(begin_state(reduced, baseline), list(parts))
-    return Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced))
+    parts = tuple(Component(one, variant, row, 500.0) for row in rows)
+    claim = Identification(effect, one.driver, rows[0], parts, 500.0, 8.0)
+    state = condition_on(begin_state(reduced, baseline), list(parts))
+    return Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced))
 
 
 def noise_of(baseline, term, axis="x"):
@@ -53,9 +53,9 @@ def noise_of(baseline, term, axis="x"):
 @pytest.fixture(scope="module")
 def shaken():
     reduced = reduced_of({"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, environment=[SHAKE])
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
-    return naming, baseline, recalibrate(naming, baseline, fit_claims(naming, baseline))
+    return naming, baseline, recalibrate(naming, baseline, fit_identifications(naming, baseline))
 
 
 def test_vibration_at_two_levels_and_never_none(shaken):
@@ -70,7 +70,7 @@ def test_vibration_at_two_levels_and_never_none(shaken):
 def test_a_diagnosis_tells_noise_and_effects_as_they_are_beside_each_other(shaken):
     """The first calibration has the vibration in its noise, and finds less of it than there is."""
     naming, baseline, after = shaken
-    fit = conclude.fitted_beside_their_noise(naming, baseline, first := fit_claims(naming, baseline))
+    fit = conclude.fitted_beside_their_noise(naming, baseline, first := fit_identifications(naming, baseline))
     assert noise_of(fit.noise, "N")[0] == noise_of(after, "N")[0] < 1.2 * 0.003
     (size,) = fit.fitted[0].parameters.values()
     assert size.low < 0.002 < size.high
@@ -87,9 +87,9 @@ def test_a_size_in_shares_of_the_noise_is_one_of_the_noise_beside_it():
         "points": [[0, 35], [600, 35], [601, 50], [1200, 50], [1201, 65], [1800, 65]],
     }
     reduced = reduced_of({"name": "temperature_noise", "linear": 0.05, "axes": ["x"]}, environment=[heat])
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "temperature_noise", "power", ("linear",))
-    first = fit_claims(naming, baseline)
+    first = fit_identifications(naming, baseline)
     fit = conclude.fitted_beside_their_noise(naming, baseline, first)
     assert first[0].parameters["linear"].high < 0.05
     growth = fit.fitted[0].parameters["linear"].value * noise_of(fit.noise, "N")[0] ** 2
@@ -124,9 +124,9 @@ def test_noise_of_held_out_time_is_not_used(shaken):
 
 def test_what_axes_share_is_no_noise_of_their_own():
     reduced = reduced_of({"name": "shared_source", "N": 0.002})
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "shared_source", "cross", ("N",), bandwidth=np.inf)
-    after = recalibrate(naming, baseline, fit_claims(naming, baseline))
+    after = recalibrate(naming, baseline, fit_identifications(naming, baseline))
     for axis in "xy":
         assert noise_of(baseline, "N", axis)[0] > 1.15 * 0.003
         value, error = noise_of(after, "N", axis)
@@ -142,18 +142,18 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
         "band": [17.5, 20.0],
     }
     reduced = reduced_of({"name": "aliased_vibration", "sensitivity": 0.3, "low": 17.5, "high": 20.0}, environment=[shaken])
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
     views = {one.view: one for one in known if one.effect == "aliased_vibration"}
     variants = {view: next(each for each in one.variants if each.values["sampling"] == "point") for view, one in views.items()}
     places = [("power", ("x",)), ("power", ("y",)), ("cross", ("x", "y"))]
-    parts = tuple(Part(views[view], variants[view], row, 500.0) for view, row in places)
-    claim = Claim("aliased_vibration", views["power"].driver, ("x", "y"), parts, 500.0, 8.0)
-    state = explain_away(begin_state(reduced, baseline), list(parts))
-    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced))
-    first = fit_claims(naming, baseline)
+    parts = tuple(Component(views[view], variants[view], row, 500.0) for view, row in places)
+    claim = Identification("aliased_vibration", views["power"].driver, ("x", "y"), parts, 500.0, 8.0)
+    state = condition_on(begin_state(reduced, baseline), list(parts))
+    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced))
+    first = fit_identifications(naming, baseline)
     noise = recalibrate(naming, baseline, first)
-    for fitted in (first, fit_claims(with_noise(naming, noise), noise)):
+    for fitted in (first, fit_identifications(with_noise(naming, noise), noise)):
         sizes = [one.value for name, one in fitted[0].parameters.items() if name.startswith("sensitivity")]
         assert sizes
         assert sizes == pytest.approx([0.3] * len(sizes), rel=0.1)
@@ -171,10 +171,10 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
 @pytest.mark.parametrize("size", [10.0, 40.0])
 def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them(size):
     reduced = reduced_of({"name": "spikes", "kind": "outlier", "per_hour": 60.0, "size": size}, axes=["x"])
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "spikes", "marks", ("outliers",))
-    naming = replace(naming, tallies=Tallies({"outliers": (np.zeros(1), np.ones(1))}))
-    (fitted,) = fit_claims(naming, baseline)
+    naming = replace(naming, tallies=CountEvidence({"outliers": (np.zeros(1), np.ones(1))}))
+    (fitted,) = fit_identifications(naming, baseline)
     for name, true in (("per_hour", 60.0), ("size", size)):
         one = fitted.parameters[name]
         assert one.low <= true <= one.high
@@ -194,9 +194,9 @@ def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them
 )
 def test_noise_before_a_filter(table, grid, lost):
     reduced = reduced_of({"name": "logger_filter", **table}, axes=["x"], lost=lost)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "logger_filter", "power", (), **grid)
-    (fitted,) = fit_claims(naming, baseline)
+    (fitted,) = fit_identifications(naming, baseline)
     name = "cutoff" if "cutoff" in table else "length"
     one = fitted.parameters[name]
     assert one.low <= table[name] <= one.high

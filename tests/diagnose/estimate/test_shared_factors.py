@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.estimate.shared_factors import shared_sizes
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.estimate.shared_factors import estimate_shared_factors
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import begin_state, cross_column, pair_rows
 from tests.support.named import COEFFICIENT, record
 
@@ -23,7 +23,7 @@ RECORDS = 8
 def quiet():
     reduced = record([])
     candidates, _ = effect_candidates(reduced, COEFFICIENT)
-    return reduced, calibrate(reduced), next(one for one in candidates if one.effect == "shared_source")
+    return reduced, calibrate_noise(reduced), next(one for one in candidates if one.effect == "shared_source")
 
 
 def sizes(quiet, factors, number, *, bandwidth=math.inf, axes=AXES):
@@ -42,8 +42,8 @@ def sizes(quiet, factors, number, *, bandwidth=math.inf, axes=AXES):
         cross[row] = factors[i] * factors[j] * cross_column(density[None, None], row, reduced) + noise
     state = begin_state(reduced.assign(cross=xr.DataArray(cross, dims=("pair", "block", "band"))), baseline)
     variant = candidate.variants[-1]
-    parts = [Part(candidate, variant, row, 10.0) for row in pair_rows(reduced) if set(row) <= set(axes)]
-    return shared_sizes(parts, axes, state)
+    parts = [Component(candidate, variant, row, 10.0) for row in pair_rows(reduced) if set(row) <= set(axes)]
+    return estimate_shared_factors(parts, axes, state)
 
 
 @pytest.mark.parametrize("bandwidth", [math.inf, 1.2])

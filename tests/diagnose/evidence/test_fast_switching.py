@@ -6,7 +6,7 @@ import xarray as xr
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.evidence.fast_switching import Hops, hop_gain, hop_powers
+from gyrostab.diagnose.evidence.fast_switching import SwitchingEvidence, switching_evidence, switching_powers
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 
@@ -53,9 +53,9 @@ def frame(pieces: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
     return data, baseline
 
 
-def found_in(course: np.ndarray, rng: np.random.Generator) -> Hops:
+def found_in(course: np.ndarray, rng: np.random.Generator) -> SwitchingEvidence:
     noise = np.sqrt(WHITE) * rng.standard_normal((BLOCKS, PIECES))
-    found = hop_gain(*frame(course.reshape(BLOCKS, PIECES) + noise), axis="x")
+    found = switching_evidence(*frame(course.reshape(BLOCKS, PIECES) + noise), axis="x")
     assert found is not None
     return found
 
@@ -116,7 +116,7 @@ def test_powers_within_blocks_are_those_of_the_samples() -> None:
     reduced = reduce_log(log, block="20s")
     size = int(reduced.attrs["block_samples"])
     seen = reduced["power"].values[0]
-    told = hop_powers(reduced["piece_mean"].values[0], 15.0, 6.0, size, 10.0)
+    told = switching_powers(reduced["piece_mean"].values[0], 15.0, 6.0, size, 10.0)
     slow = reduced["frequency"].values < 0.3
     np.testing.assert_allclose(told[:, slow].mean(axis=0), seen[:, slow].mean(axis=0), rtol=0.05)
     np.testing.assert_allclose(told.mean(axis=0), seen.mean(axis=0), rtol=0.25)  # the number of hops is one of chance

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.evidence.held_out import mean_factors, mean_gains, noise_columns, power_factors, power_gains, score
+from gyrostab.diagnose.evidence.held_out import mean_evidence, mean_factors, noise_columns, power_evidence, power_factors, score
 from gyrostab.diagnose.evidence.products import WIDTHS
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import gains, totals
+from gyrostab.diagnose.predict.search import compute_evidence, totals
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
@@ -204,8 +204,8 @@ def test_what_is_there_gains_and_what_is_not_does_not():
     candidates = {"step": [step], "sine": [np.sin(np.arange(n) / p) for p in (3.0, 9.0)]}
     loud = data.assign(mean=data["mean"] + xr.DataArray(0.2 * step, dims="block"))
     spoken = power.assign(power=power["power"] * (1.0 + 0.1 * xr.DataArray(trend, dims=("block", "band"))))
-    quiet_means, loud_means = (mean_gains(one, baseline, candidates, axis="x") for one in (data, loud))
-    quiet, risen = (power_gains(one, level, {"trend": [trend]}, axis="x") for one in (power, spoken))
+    quiet_means, loud_means = (mean_evidence(one, baseline, candidates, axis="x") for one in (data, loud))
+    quiet, risen = (power_evidence(one, level, {"trend": [trend]}, axis="x") for one in (power, spoken))
     assert quiet_means.dims == ("candidate", "record")
     assert float(loud_means.sel(candidate="step").min()) > 8.0
     assert float(loud_means.sel(candidate="sine").max()) < 8.0
@@ -219,10 +219,10 @@ def test_designs_that_are_constant_or_empty_gain_nothing():
     data, baseline = mean_case(n, records=3)
     absent = np.zeros(n)
     absent[np.isnan(data["mean"].values[0, 0])] = 1.0
-    gains = mean_gains(data, baseline, {"constant": [np.ones(n)], "nothing": [np.zeros(n)], "in a gap": [absent]}, axis="x")
+    gains = mean_evidence(data, baseline, {"constant": [np.ones(n)], "nothing": [np.zeros(n)], "in a gap": [absent]}, axis="x")
     assert np.abs(gains).max() < 1e-9
     power, level = power_case(n, 6, records=3)
-    flat = power_gains(power, level, {"level": [np.ones((n, 6)) * 3600.0 / level["spectrum"].values[0]]}, axis="x")
+    flat = power_evidence(power, level, {"level": [np.ones((n, 6)) * 3600.0 / level["spectrum"].values[0]]}, axis="x")
     assert np.abs(flat).max() < 0.05
 
 
@@ -230,7 +230,7 @@ def test_units_of_a_design_do_not_matter():
     n = 80
     data, baseline = mean_case(n, records=4)
     design = np.random.default_rng(3).standard_normal((n, 2))
-    one, other = (mean_gains(data, baseline, {"c": [design * unit]}, axis="x") for unit in (1.0, np.array([1e-9, 1e6])))
+    one, other = (mean_evidence(data, baseline, {"c": [design * unit]}, axis="x") for unit in (1.0, np.array([1e-9, 1e6])))
     np.testing.assert_allclose(one, other, atol=1e-7)
 
 
@@ -249,9 +249,9 @@ def test_folds_are_interleaved_and_scale_with_the_record():
 def test_wrong_designs_and_tiers_are_named():
     data, baseline = mean_case(30, records=1)
     with pytest.raises(OptionError, match=r"shape \(29,\)"):
-        mean_gains(data, baseline, {"short": [np.ones(29)]}, axis="x")
+        mean_evidence(data, baseline, {"short": [np.ones(29)]}, axis="x")
     with pytest.raises(OptionError, match="'hard'"):
-        mean_gains(data, baseline, {"one": [np.ones(30)]}, axis="x", tier="hard")
+        mean_evidence(data, baseline, {"one": [np.ones(30)]}, axis="x", tier="hard")
 
 
 def test_many_records_take_seconds():
@@ -262,8 +262,8 @@ def test_many_records_take_seconds():
     means = {str(i): [np.cumsum(rng.standard_normal(n)) for _ in range(3)] for i in range(20)}
     powers = {str(i): [rng.standard_normal((n, 16)) for _ in range(3)] for i in range(20)}
     begin = time.process_time()
-    mean_gains(data, baseline, means, axis="x")
-    power_gains(power, level, powers, axis="x")
+    mean_evidence(data, baseline, means, axis="x")
+    power_evidence(power, level, powers, axis="x")
     assert time.process_time() - begin < 10.0
 
 
@@ -271,7 +271,7 @@ def test_a_spectrum_that_falls_is_no_quantization_of_negative_power():
     """A mean of two neighbours takes ``4 a (1 - a) sin^2(pi f / fs)`` off, the form of Q: but the square of Q ends at zero."""
     raw = np.random.default_rng(12).standard_normal((1, 20_001))
     reduced = reduce_log(make_log(0.9 * raw[:, 1:] + 0.1 * raw[:, :-1], rate=10.0, unit="deg/h"))
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     design = [np.tile(np.sin(np.pi * reduced["frequency"].values / 10.0) ** 2, (reduced.sizes["block"], 1))]
     found = power_factors(reduced, baseline, design, axis="x")[0, 1, 0]
     beside_any = power_factors(reduced, baseline.drop_vars("posterior"), design, axis="x")[0, 1, 0]
@@ -285,11 +285,11 @@ def test_a_weak_filter_gains_more_than_noise_reaches(share, least, most):
     """Six per cent of every sample come late: the spectrum falls by a quarter towards its end."""
     raw = np.random.default_rng(12).standard_normal((2, 15_001))
     reduced = reduce_log(make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h"))
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     filters = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == "logger_filter"]
     (noise,) = null_records(reduced, baseline, count=200, rng=np.random.default_rng(3), chunk=200)
     start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    (found,) = totals(gains(filters, reduced, start, folds)).values()
-    (drawn,) = totals(gains(filters, noise, start, folds, rng=np.random.default_rng(1))).values()
+    (found,) = totals(compute_evidence(filters, reduced, start, folds)).values()
+    (drawn,) = totals(compute_evidence(filters, noise, start, folds, rng=np.random.default_rng(1))).values()
     assert least < found[0] < most
     assert np.quantile(drawn, 0.99) < 5.0

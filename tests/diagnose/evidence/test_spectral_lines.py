@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.spectral_lines import line_gains, line_skirt
+from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.identify.components import by_key, without_lines
 from gyrostab.diagnose.identify.forward_search import name_effects
-from gyrostab.diagnose.identify.identification import Claim, form_error, with_claim
+from gyrostab.diagnose.identify.identification import Identification, add_identification, form_error
 from gyrostab.diagnose.identify.sample_sizes import line_size
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.designs import Candidate, Variant
 from gyrostab.diagnose.predict.filter_response import straightened
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import gains, of_means
+from gyrostab.diagnose.predict.search import compute_evidence, of_means
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
@@ -39,20 +39,20 @@ def spectra(density: np.ndarray, *, records: int = 20, seed: int = 1) -> np.ndar
 def test_slopes_and_humps_are_no_lines() -> None:
     place = np.arange(1.0, 601.0)
     for density in (place**-2.0, place**2.0, 1.0 + 50.0 * np.exp(-(((place - 90.0) / 15.0) ** 2))):
-        gain = line_gains(spectra(density[None]), WEIGHT)
+        gain = line_evidence(spectra(density[None]), WEIGHT)
         assert gain.max(axis=-1).max() < 8.0  # of 12 000 lines
 
 
 def test_what_comes_and_goes_is_no_steady_line() -> None:
     once = np.ones((8, 400))
     once[3, 200] = 40.0
-    assert line_gains(spectra(once), WEIGHT)[..., 200].max() < 0.0
+    assert line_evidence(spectra(once), WEIGHT)[..., 200].max() < 0.0
 
 
 def test_a_line_under_a_level_that_changes_is_found_by_its_own_power() -> None:
     level = np.array([1, 1, 1, 50, 50, 1, 1, 1.0])[:, None] * np.ones(400)
     level[:, 200] += 2.0
-    found = line_gains(spectra(level), WEIGHT)[:, 0]
+    found = line_evidence(spectra(level), WEIGHT)[:, 0]
     assert (found.argmax(axis=-1) == 200).all()
     assert found.max(axis=-1).min() > 20.0
 
@@ -82,13 +82,13 @@ def test_the_skirt_holds_the_line_and_no_other(wander: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def lines() -> tuple[Claim, ...]:
+def lines() -> tuple[Identification, ...]:
     reduced = sines({0.7: 0.25, 2.03: 0.15, 4.06: 0.2}, size=12_000)
     baseline, records = nulls(reduced, 40)
     return name_effects(reduced, baseline, records).claims
 
 
-def test_each_line_is_a_claim_of_its_own(lines: tuple[Claim, ...]) -> None:
+def test_each_line_is_a_claim_of_its_own(lines: tuple[Identification, ...]) -> None:
     assert [claim.effect for claim in lines] == ["spectral_line"] * 3
     assert all(claim.axes == ("x",) for claim in lines)
     assert all(len({part.place for part in claim.parts}) == 1 for claim in lines)
@@ -98,18 +98,18 @@ def test_each_line_is_a_claim_of_its_own(lines: tuple[Claim, ...]) -> None:
 
 def test_a_line_changes_no_gain_of_the_means() -> None:
     reduced = sines({0.7: 0.4}, size=9_000, axes=1)
-    state, folds = begin_state(reduced, calibrate(reduced)), fold_blocks(reduced)
+    state, folds = begin_state(reduced, calibrate_noise(reduced)), fold_blocks(reduced)
     candidates, _ = effect_candidates(reduced, state.baseline["coefficient"])
-    found = gains(candidates, reduced, state, folds)
+    found = compute_evidence(candidates, reduced, state, folds)
     line, jump = (by_key(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
     assert line.gain > 10.0
-    named = explain_away(state, [line])
+    named = condition_on(state, [line])
     kept = of_means(found, state, named)
     assert {one.candidate.view for one in kept} == {"mean", "levels"}
-    again = gains([one.candidate for one in kept], named.reduced, named, folds)
+    again = compute_evidence([one.candidate for one in kept], named.reduced, named, folds)
     for one, other in zip(kept, again, strict=True):
         np.testing.assert_array_equal(one.gain, other.gain)
-    assert not of_means(found, state, explain_away(state, [jump]))
+    assert not of_means(found, state, condition_on(state, [jump]))
     lost = replace(state, reduced=reduced.assign(mean=reduced["mean"].where(reduced["begin"] > 0.0)))
     assert not of_means(found, state, lost)
 
@@ -117,13 +117,13 @@ def test_a_line_changes_no_gain_of_the_means() -> None:
 # ------------------------------------------------------------------------------------------------------------ bookkeeping
 
 
-def part(effect: str, view: str, gain: float, place: int = -1) -> Part:
+def part(effect: str, view: str, gain: float, place: int = -1) -> Component:
     variant = Variant({}, ("size",), np.empty(0))
-    return Part(Candidate(effect, view, (), (variant,)), variant, ("x",), gain, place)
+    return Component(Candidate(effect, view, (), (variant,)), variant, ("x",), gain, place)
 
 
-def claim(one: Part) -> Claim:
-    return Claim(one.candidate.effect, (), one.row, (one,), one.gain, 7.0)
+def claim(one: Component) -> Identification:
+    return Identification(one.candidate.effect, (), one.row, (one,), one.gain, 7.0)
 
 
 def test_a_line_counts_for_the_plainest_name_only() -> None:
@@ -140,10 +140,10 @@ def test_a_line_counts_for_the_plainest_name_only() -> None:
 
 def test_claims_of_one_effect_become_one_but_for_lines_of_other_frequencies() -> None:
     first = claim(part("spectral_line", "line", 50.0, 3))
-    assert len(with_claim([first], claim(part("spectral_line", "line", 20.0, 9)))) == 2
-    (both,) = with_claim([first], replace(claim(part("spectral_line", "line", 20.0, 3)), axes=("y",)))
+    assert len(add_identification([first], claim(part("spectral_line", "line", 20.0, 9)))) == 2
+    (both,) = add_identification([first], replace(claim(part("spectral_line", "line", 20.0, 3)), axes=("y",)))
     assert (both.axes, both.gain) == (("x", "y"), 70.0)
-    assert len(with_claim([claim(part("shupe", "mean", 9.0))], claim(part("shupe", "mean", 8.0)))) == 1
+    assert len(add_identification([claim(part("shupe", "mean", 9.0))], claim(part("shupe", "mean", 8.0)))) == 1
 
 
 def test_a_steady_line_leaves_no_error_of_its_form() -> None:
@@ -179,7 +179,7 @@ def test_a_spectrum_is_straightened_by_as_much_as_its_filter_takes(weight: float
     assert level == pytest.approx(1.0, abs=0.05)
     assert slope * 5.0 == pytest.approx(0.0, abs=0.13)
     assert stopped.any() == (weight == 0.5)
-    gains = line_gains(found["line_power"].values[None], found["line_weight"].values)[0, 0]
+    gains = line_evidence(found["line_power"].values[None], found["line_weight"].values)[0, 0]
     assert lines[gains.argmax()] == pytest.approx(4.0, abs=0.1)
     assert gains.max() > 20.0
     assert np.where(near | stopped, -np.inf, gains).max() < 5.0

@@ -8,14 +8,14 @@ import xarray as xr
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.estimate.telegraph_sizes import level_sizes
-from gyrostab.diagnose.evidence.telegraph import HOPS, level_courses, level_gains
+from gyrostab.diagnose.estimate.telegraph_sizes import estimate_telegraph
+from gyrostab.diagnose.evidence.telegraph import MEAN_SWITCHES, telegraph_courses, telegraph_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects
-from gyrostab.diagnose.identify.identifiability import possible
-from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.identify.switching import followed_first, hops_alone
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Part, take_parts
+from gyrostab.diagnose.predict.condition import Component, condition_on_components
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Found
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -64,7 +64,7 @@ def white(rng: np.random.Generator, records: int) -> np.ndarray:
 def test_finds_hops_and_their_numbers() -> None:
     rng = np.random.default_rng(1)
     course = np.stack([hops(rng, 120.0, 240.0) for _ in range(20)])
-    gain, found = level_gains(*frame(0.6 * course + white(rng, 20)), axis="x")
+    gain, found = telegraph_evidence(*frame(0.6 * course + white(rng, 20)), axis="x")
     assert np.median(gain) > 20.0
     assert (gain > 5.0).mean() >= 0.9
     assert np.median(found.step) == pytest.approx(0.6, rel=0.05)
@@ -76,7 +76,7 @@ def test_finds_hops_beside_a_walk_of_several_steps() -> None:
     rng = np.random.default_rng(2)
     walk = np.cumsum(0.07 * rng.standard_normal((20, BLOCKS)), axis=1)
     course = np.stack([hops(rng, 150.0, 150.0) for _ in range(20)])
-    gain, found = level_gains(*frame(1.5 * course + walk + white(rng, 20)), axis="x")
+    gain, found = telegraph_evidence(*frame(1.5 * course + walk + white(rng, 20)), axis="x")
     assert np.median(gain) > 10.0
     assert np.median(found.step[gain > 10.0]) == pytest.approx(1.5, rel=0.1)
 
@@ -86,7 +86,7 @@ def test_is_a_lower_bound_of_a_bayes_factor() -> None:
     rng = np.random.default_rng(3)
     K = rng.choice(WALKS, 300) * np.sqrt(STEP / 3600.0)
     mean = white(rng, 300) + np.cumsum(K[:, None] * rng.standard_normal((300, BLOCKS)), axis=1)
-    gain, _ = level_gains(*frame(mean), axis="x")
+    gain, _ = telegraph_evidence(*frame(mean), axis="x")
     assert np.isfinite(gain).mean() > 0.3
     assert np.exp(gain).mean() < 1.0
     assert gain.max() < 4.0
@@ -98,15 +98,15 @@ def test_a_bias_on_a_spring_is_no_bias_of_two_levels(time: float, size: float) -
     rng = np.random.default_rng(4)
     keep = np.exp(-1.0 / time)
     fine = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal((30, BLOCKS * 20 + 3000)))[:, -BLOCKS * 20 :]
-    gain, _ = level_gains(*frame(size * fine.reshape(30, BLOCKS, 20).mean(axis=2) + white(rng, 30)), axis="x")
+    gain, _ = telegraph_evidence(*frame(size * fine.reshape(30, BLOCKS, 20).mean(axis=2) + white(rng, 30)), axis="x")
     assert gain.max() < 3.0
 
 
 def test_one_jump_and_back_are_no_two_levels() -> None:
     mean = np.zeros((1, BLOCKS)) + np.repeat([0.0, 2.0, 0.0], [30, 40, 30])
-    gain, found = level_gains(*frame(mean + white(np.random.default_rng(5), 1)), axis="x")
+    gain, found = telegraph_evidence(*frame(mean + white(np.random.default_rng(5), 1)), axis="x")
     assert found.hops[0] == pytest.approx(2.0, abs=0.2)
-    assert found.hops[0] < HOPS
+    assert found.hops[0] < MEAN_SWITCHES
     assert gain[0] == -np.inf
 
 
@@ -116,10 +116,10 @@ def test_what_is_given_is_not_found_again_and_blocks_may_be_missing() -> None:
     ramp = np.linspace(0.0, 20.0, BLOCKS)
     data, baseline = frame((0.8 * course + ramp)[None] + white(rng, 1))
     data["mean"][:, :, 20:35] = np.nan
-    with_ramp, found = level_gains(data, baseline, axis="x", given=ramp[:, None])
+    with_ramp, found = telegraph_evidence(data, baseline, axis="x", given=ramp[:, None])
     assert with_ramp[0] > 10.0
     assert found.step[0] == pytest.approx(0.8, abs=0.1)
-    again, _ = level_gains(data, baseline, axis="x", given=np.stack([ramp, course], axis=1))
+    again, _ = telegraph_evidence(data, baseline, axis="x", given=np.stack([ramp, course], axis=1))
     assert again[0] < 1.0
 
 
@@ -127,15 +127,15 @@ def test_the_other_sign_is_the_same_bias() -> None:
     rng = np.random.default_rng(7)
     values = (hops(rng, 100.0, 300.0) + white(rng, 1)[0])[:, None]
     variance, all_there, constant = np.full(BLOCKS, WHITE), np.ones(BLOCKS, bool), np.ones((BLOCKS, 1))
-    one, other = (level_courses(sign * values, variance, all_there, constant) for sign in (1.0, -1.0))
+    one, other = (telegraph_courses(sign * values, variance, all_there, constant) for sign in (1.0, -1.0))
     np.testing.assert_allclose(one.share, 1.0 - other.share, atol=0.02)
     np.testing.assert_allclose(one.times, other.times[:, ::-1], rtol=0.02)
     np.testing.assert_allclose(one.step, other.step, rtol=0.01)
 
 
-def part(state: State, course: np.ndarray, axis: str = "x", gain: float = 50.0) -> Part:
+def part(state: State, course: np.ndarray, axis: str = "x", gain: float = 50.0) -> Component:
     variant = Variant({"low": 100.0, "high": 200.0, "hops": 18.0}, ("step",), course[None, None])
-    return Part(Candidate("telegraph", "levels", (), (variant,)), variant, (axis,), gain)
+    return Component(Candidate("telegraph", "levels", (), (variant,)), variant, (axis,), gain)
 
 
 def state_of(mean: np.ndarray) -> State:
@@ -147,16 +147,16 @@ def test_a_bias_of_three_levels_is_not_possible() -> None:
     rng = np.random.default_rng(8)
     first, second = hops(rng, 150.0, 150.0), hops(rng, 200.0, 200.0)
     two = state_of(first + white(rng, 1)[0])
-    assert possible([part(two, first)], two)
+    assert is_physical([part(two, first)], two)
     more = state_of(first + 0.8 * second + white(rng, 1)[0])
-    assert not possible([part(more, first)], more)
+    assert not is_physical([part(more, first)], more)
 
 
 def test_sizes_are_those_of_the_course() -> None:
     rng = np.random.default_rng(9)
     course = hops(rng, 100.0, 200.0)
     state = state_of(0.5 * course + white(rng, 1)[0])
-    sizes = level_sizes([part(state, course)], ("x",), state)
+    sizes = estimate_telegraph([part(state, course)], ("x",), state)
     value, error = sizes["step"]
     assert abs(value - 0.5) < 4.0 * error
     assert 0.015 < error < 0.06  # twice the noise of a mean over the root of the blocks
@@ -164,15 +164,15 @@ def test_sizes_are_those_of_the_course() -> None:
     assert sizes["high"] == (200.0, pytest.approx(200.0 / 3.0))
 
 
-def led(course: np.ndarray, gain: float, axis: str = "x") -> Part:
+def led(course: np.ndarray, gain: float, axis: str = "x") -> Component:
     """A mean that follows the temperature."""
     variant = Variant({}, ("sensitivity",), course[None, None])
-    return Part(Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, (axis,), gain)
+    return Component(Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, (axis,), gain)
 
 
-def jump(place: int, gain: float) -> Part:
+def jump(place: int, gain: float) -> Component:
     variant = Variant({"at": place * STEP}, ("step",), (np.arange(BLOCKS) >= place).astype(float)[None, None])
-    return Part(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), gain)
+    return Component(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), gain)
 
 
 FOLLOWS, HOPS_FIRST = ["temperature_bias(temperature)"], ["telegraph", "temperature_bias(temperature)"]
@@ -215,24 +215,24 @@ def test_jumps_that_are_hops_themselves_are_none(size: float, places: tuple[int,
 
     def gains(_: object, state: State) -> list[Found]:
         columns = state.given.get(("mean", "x"), [])
-        gain, found = level_gains(state.reduced, state.baseline, axis="x", given=np.stack(columns, axis=-1) if columns else None)
+        gain, found = telegraph_evidence(state.reduced, state.baseline, axis="x", given=np.stack(columns, axis=-1) if columns else None)
         return [Found(candidate, [("x",)], gain[:, None], (Variant({}, ("step",), found.share[0][None, None]),))]
 
-    def state_with(some: Sequence[Claim]) -> State:
-        return take_parts(start, [one for claim in some for one in claim.parts])
+    def state_with(some: Sequence[Identification]) -> State:
+        return condition_on_components(start, [one for claim in some for one in claim.parts])
 
     jumps = [jump(place if place == REAL else int(moves[place]), 20.0) for place in places]
-    first = Claim("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
+    first = Identification("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
     (beside,) = gains((), state_with([first]))
     gain = float(beside.gain[0, 0])
-    hopping = Claim("telegraph", (), ("x",), (Part(candidate, beside.best[0], ("x",), gain),), gain, 8.0)
+    hopping = Identification("telegraph", (), ("x",), (Component(candidate, beside.best[0], ("x",), gain),), gain, 8.0)
     left = hops_alone([first, hopping], state_with, gains, 8.0)
     assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
     assert [one.variant.values["at"] for one in left[0].parts if one.candidate.effect == "bias_jump"] == [place * STEP for place in kept]
     assert np.abs(np.corrcoef(left[-1].parts[0].variant.design[0, 0], course)[0, 1]) > 0.98
 
 
-def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Naming:
+def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Identifications:
     """What a bias that switches between two levels, for so many blocks each, is named, beside a supply that does so with a scatter [V]."""
     course = np.repeat(np.arange(len(stays)) % 2, stays).astype(float)
     rng = np.random.default_rng(seed)

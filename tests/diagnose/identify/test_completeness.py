@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.completeness import unrest
+from gyrostab.diagnose.identify.completeness import variance_fluctuation
 from gyrostab.diagnose.identify.forward_search import _Search, name_effects
 from gyrostab.diagnose.predict.condition import reweighted
 from gyrostab.diagnose.predict.linear_model import State, begin_state
-from gyrostab.diagnose.predict.nuisance import generic_candidates
-from gyrostab.diagnose.predict.search import Found, Tallies, gains
+from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
+from gyrostab.diagnose.predict.search import CountEvidence, Found, compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
@@ -36,9 +36,9 @@ def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Datas
 
 def left(reduced: xr.Dataset, *columns: np.ndarray) -> float:
     """Unrest beside columns (block,) of added white power."""
-    state: State = begin_state(reduced, calibrate(reduced))
+    state: State = begin_state(reduced, calibrate_noise(reduced))
     spread = [np.broadcast_to(one[:, None], state.weight.shape[1:]).astype(float) for one in columns]
-    return unrest(reweighted(state.with_columns("power", "x", spread)) if columns else state, "x")
+    return variance_fluctuation(reweighted(state.with_columns("power", "x", spread)) if columns else state, "x")
 
 
 @pytest.mark.parametrize("gaps", [False, True])
@@ -67,9 +67,9 @@ def test_blocks_that_are_masked_do_not_count() -> None:
     burst = np.ones(BLOCKS)
     burst[20:40] = 1.5
     reduced = record(burst)
-    state = begin_state(reduced, calibrate(reduced))
-    assert unrest(state, "x") > 8.0
-    assert unrest(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
+    state = begin_state(reduced, calibrate_noise(reduced))
+    assert variance_fluctuation(state, "x") > 8.0
+    assert variance_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
 
 
 def test_a_smooth_name_for_bursts_is_taken_back() -> None:
@@ -91,13 +91,13 @@ def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
     loud = np.ones(BLOCKS)
     loud[40:60] = 20.0
     reduced = reduce_log(make_log(rng.standard_normal((2, BLOCKS * LENGTH)) * np.repeat(loud, LENGTH), rate=10.0, unit="deg/h"))
-    state = begin_state(reduced, calibrate(reduced))
-    search = _Search(generic_candidates(reduced), fold_blocks(reduced), Tallies({}), 7.0)
+    state = begin_state(reduced, calibrate_noise(reduced))
+    search = _Search(nuisance_alternatives(reduced), fold_blocks(reduced), CountEvidence({}), 7.0)
 
     def common(found: list[Found]) -> float:
         return max(float(one.gain.max()) for one in found if one.candidate.effect == "~cov")
 
-    assert common(gains(search.candidates, reduced, state, search.folds)) > 100.0
+    assert common(compute_evidence(search.candidates, reduced, state, search.folds)) > 100.0
     assert common(search._ranked(state, set())) < 3.0
 
 

@@ -7,18 +7,18 @@ import pytest
 import xarray as xr
 from scipy.signal import lfilter
 
-from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key, gain_sum
+from gyrostab.diagnose.identify.components import by_key, sum_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects
-from gyrostab.diagnose.identify.identifiability import possible
-from gyrostab.diagnose.identify.surrogates import beats_slides
+from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, effect_candidates
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State, begin_state
 from gyrostab.diagnose.predict.nuisance import stretches
-from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import phase_locked as locked
 from gyrostab.ingest.make_log import make_log
@@ -44,7 +44,7 @@ def loud(factor: np.ndarray) -> np.ndarray:
 
 def started(rate: np.ndarray) -> State:
     reduced = reduced_of(rate)
-    return begin_state(reduced, from_model(reduced, {**MODEL, "log": {"axes": [str(one) for one in reduced["axis"].values]}}))
+    return begin_state(reduced, baseline_from_model(reduced, {**MODEL, "log": {"axes": [str(one) for one in reduced["axis"].values]}}))
 
 
 def candidate(state: State, effect: str, view: str) -> Candidate:
@@ -52,8 +52,8 @@ def candidate(state: State, effect: str, view: str) -> Candidate:
     return next(one for one in known if (one.effect, one.view) == (effect, view))
 
 
-def parts_of(state: State, one: Candidate) -> list[Part]:
-    return by_key(gains([one], state.reduced, state, fold_blocks(state.reduced)))[one.key]
+def parts_of(state: State, one: Candidate) -> list[Component]:
+    return by_key(compute_evidence([one], state.reduced, state, fold_blocks(state.reduced)))[one.key]
 
 
 @pytest.mark.parametrize("inside", [slice(0, 3), slice(-4, None)])
@@ -93,8 +93,8 @@ def test_waves_slower_than_a_block_are_no_jumps(size: float, jump: bool) -> None
     waves[SECOND < 1800.0] = 0.0
     state = started(WHITE * np.random.default_rng(4).standard_normal((1, SECOND.size)) + waves + size * (SECOND >= 1000.0))
     found = parts_of(state, candidate(state, "bias_jump", "mean"))
-    assert gain_sum(found) > 20.0
-    assert bool(possible(found, state)) == jump
+    assert sum_evidence(found) > 20.0
+    assert bool(is_physical(found, state)) == jump
 
 
 @pytest.mark.parametrize(("back", "jump"), [(2.0, False), (1.2, True)])
@@ -102,8 +102,8 @@ def test_what_comes_back_to_the_same_level_is_an_event(back: float, jump: bool) 
     course = 2.0 * (SECOND >= 1000.0) - back * (SECOND >= 1160.0)
     state = started(WHITE * np.random.default_rng(4).standard_normal((1, SECOND.size)) + course)
     found = parts_of(state, candidate(state, "bias_jump", "mean"))
-    assert gain_sum(found) > 8.0
-    assert bool(possible(found, state)) == jump
+    assert sum_evidence(found) > 8.0
+    assert bool(is_physical(found, state)) == jump
 
 
 @pytest.mark.parametrize(("back", "jump"), [(1.0, False), (0.0, True)])
@@ -113,8 +113,8 @@ def test_a_slight_event_that_lasts_long_is_no_jump(back: float, jump: bool) -> N
     course = 0.12 * ((second >= 3000.0) - back * (second >= 3640.0))
     state = started(WHITE * np.random.default_rng(5).standard_normal((1, second.size)) + course)
     found = parts_of(state, candidate(state, "bias_jump", "mean"))
-    assert gain_sum(found) > 8.0
-    assert bool(possible(found, state)) == jump
+    assert sum_evidence(found) > 8.0
+    assert bool(is_physical(found, state)) == jump
 
 
 @pytest.mark.parametrize("moves", [False, True])
@@ -127,7 +127,7 @@ def test_only_motion_leaks(moves: bool) -> None:
     rate += 30.0 * WHITE * np.array([[0.015], [1.0]]) * sway * moves
     state = started(rate)
     leaks = [one for one in effect_candidates(state.reduced, state.baseline["coefficient"])[0] if one.key == "misalignment(y)"]
-    (found,) = gains(leaks, state.reduced, state, fold_blocks(state.reduced))
+    (found,) = compute_evidence(leaks, state.reduced, state, fold_blocks(state.reduced))
     assert (float(found.gain[0, 0]) > 20.0) == moves
     assert moves or float(found.gain.max()) < 3.0
 
@@ -140,8 +140,8 @@ def test_what_is_at_rest_cannot_leak(sway: float) -> None:
     rate[1] += sway * WHITE * np.sin(2.0 * np.pi * 1.7 * SECOND)
     state = started(rate)
     one = next(each for each in effect_candidates(state.reduced, state.baseline["coefficient"])[0] if each.key == "misalignment(y)")
-    part = Part(one, one.variants[0], ("x",), 20.0)
-    assert possible([part], state) == ([part] if sway else [])
+    part = Component(one, one.variants[0], ("x",), 20.0)
+    assert is_physical([part], state) == ([part] if sway else [])
 
 
 @pytest.mark.parametrize("leak", [0.0, 0.003])
@@ -151,7 +151,7 @@ def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) 
     state = started(WHITE * rng.standard_normal((2, SECOND.size)) + np.array([[leak], [1.0]]) * turning)
     one = candidate(state, "misalignment", "mean")
     variant = next(each for each in one.variants if each.columns == ("y",))
-    beats, p_value = beats_slides([Part(one, variant, ("x",), 20.0)], state, fold_blocks(state.reduced))
+    beats, p_value = passes_time_shift_test([Component(one, variant, ("x",), 20.0)], state, fold_blocks(state.reduced))
     assert np.isfinite(p_value)
     assert beats == bool(leak)
 
@@ -182,14 +182,14 @@ def turned(rate: np.ndarray, turns: np.ndarray) -> State:
     log = make_log(rate, rate=RATE, unit="deg/h")
     turning = 360.0 * np.gradient(turns, SECOND)
     reduced = reduce_log(log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block="20s")
-    return begin_state(reduced, from_model(reduced, {**MODEL, "log": {"axes": ["x"]}}))
+    return begin_state(reduced, baseline_from_model(reduced, {**MODEL, "log": {"axes": ["x"]}}))
 
 
 @pytest.mark.parametrize("size", [0.0, 6.0])
 def test_waves_that_do_not_turn_with_the_tool_are_no_line_of_its_turning(size: float) -> None:
     state = swelling(size)
     found = parts_of(state, candidate(state, "rotation_line", "order"))
-    assert (gain_sum(found) > 15.0) == (size > 0.0)
+    assert (sum_evidence(found) > 15.0) == (size > 0.0)
 
 
 def test_what_turns_with_the_tool_leaves_the_noise_about_it_alone() -> None:

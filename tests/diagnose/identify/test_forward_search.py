@@ -10,12 +10,12 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.evidence.sample_counts import count_gains, expected_counts
-from gyrostab.diagnose.evidence.spectral_lines import line_gains
-from gyrostab.diagnose.identify.forward_search import Claim, name_effects, tail_level
-from gyrostab.diagnose.identify.identifiability import possible
-from gyrostab.diagnose.identify.surrogates import beats_slides
-from gyrostab.diagnose.predict.condition import Part, explain_away
+from gyrostab.diagnose.evidence.sample_counts import count_evidence, expected_counts
+from gyrostab.diagnose.evidence.spectral_lines import line_evidence
+from gyrostab.diagnose.identify.forward_search import Identification, name_effects, tail_level
+from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
+from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.search import together
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError
@@ -65,18 +65,18 @@ def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
     elsewhere = [replace(part, row=(axis,)) for axis in "yz"]
     sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
     monkeypatch.setattr(sys.modules["gyrostab.diagnose.predict.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
-    assert possible([part, *elsewhere], state) == [part, elsewhere[1]]
+    assert is_physical([part, *elsewhere], state) == [part, elsewhere[1]]
 
 
 def test_sizes_beyond_what_the_registry_allows_are_impossible(shaken):
     """A bias of 15 deg/h for each of some 40 degC is that of a broken instrument, or no effect of temperature."""
     bias = next(one for one in shaken.candidates if one.effect == "temperature_bias" and one.view == "mean")
     variant = next(one for one in bias.variants if one.columns == ("sensitivity",))
-    part = Part(bias, variant, ("y",), 50.0)
+    part = Component(bias, variant, ("y",), 50.0)
     for size, answer in ((5.0, [part]), (15.0, [])):
         state = shaken.state
         mean = state.reduced["mean"] + size * xr.DataArray(variant.design[0, 0], dims="block").where(state.reduced["axis"] == "y", 0.0)
-        assert possible([part], replace(state, reduced=state.reduced.assign(mean=mean))) == answer
+        assert is_physical([part], replace(state, reduced=state.reduced.assign(mean=mean))) == answer
 
 
 @pytest.mark.parametrize(
@@ -113,11 +113,11 @@ def test_two_effects_are_both_named():
 def test_slid_channels_do_worse(shaken):
     (claim,) = shaken.claims
     start = replace(shaken.state, given={})
-    beats, p_value = beats_slides(claim.parts, start, shaken.folds)
+    beats, p_value = passes_time_shift_test(claim.parts, start, shaken.folds)
     assert beats
     assert p_value <= 0.01
     elsewhere = [replace(part, row=("z",)) for part in claim.parts]
-    assert not beats_slides(elsewhere, start, shaken.folds)[0]
+    assert not passes_time_shift_test(elsewhere, start, shaken.folds)[0]
 
 
 def test_what_is_named_is_taken_out_of_the_rest(shaken):
@@ -126,7 +126,7 @@ def test_what_is_named_is_taken_out_of_the_rest(shaken):
     vibration = shaken.state.reduced["channel_vibration"].values
     assert loud[vibration > 4].mean() > 1.2
     assert loud[vibration < 1].mean() == pytest.approx(1.0, abs=0.05)
-    again = explain_away(shaken.state, list(claim.parts))
+    again = condition_on(shaken.state, list(claim.parts))
     np.testing.assert_allclose(again.weight, shaken.state.weight, rtol=1e-3)
 
 
@@ -138,7 +138,7 @@ def test_too_few_null_records_are_refused():
 
 
 def test_claims_are_plain(shaken):
-    assert all(isinstance(claim, Claim) for claim in shaken.claims)
+    assert all(isinstance(claim, Identification) for claim in shaken.claims)
 
 
 # ---------------------------------------------------------------------------------------------------------------- parts
@@ -166,8 +166,8 @@ def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
     mean, spread = expected_counts(usual)
     np.testing.assert_allclose(mean.mean(axis=1), 0.05, rtol=0.1)
     np.testing.assert_allclose(spread, 1.0, atol=0.2)
-    null = count_gains(usual, mean, spread, subsets(120))
-    raised = count_gains(rng.poisson(0.3, (50, 2, 120)), mean, spread, subsets(120))
+    null = count_evidence(usual, mean, spread, subsets(120))
+    raised = count_evidence(rng.poisson(0.3, (50, 2, 120)), mean, spread, subsets(120))
     assert np.quantile(null, 0.99) < 3.0
     assert raised.min() > 5.0
 
@@ -180,8 +180,8 @@ def test_blocks_that_are_lost_are_expected_to_count_nothing():
     mean, spread = expected_counts(usual)
     np.testing.assert_allclose([mean[0, there].mean(), mean[0, ~there].mean()], [1.0, 0.0], atol=0.02)
     assert (mean > 0.0).all()
-    few = count_gains(rng.poisson(0.5 * there, (50, 1, 120)), mean, spread, subsets(120))
-    many = count_gains(rng.poisson(3.0 * there, (50, 1, 120)), mean, spread, subsets(120))
+    few = count_evidence(rng.poisson(0.5 * there, (50, 1, 120)), mean, spread, subsets(120))
+    many = count_evidence(rng.poisson(3.0 * there, (50, 1, 120)), mean, spread, subsets(120))
     assert few.max() < 3.0
     assert many.min() > 40.0
 
@@ -205,9 +205,9 @@ def test_a_line_stands_out_at_its_place_only():
     rng = np.random.default_rng(5)
     weight = np.full((1, 8), 22.0)
     power = rng.gamma(22.0, 1 / 22.0, (40, 1, 8, 500))
-    null = line_gains(power, weight).max(axis=-1)
+    null = line_evidence(power, weight).max(axis=-1)
     power[:, :, :, 123] *= 2.0
-    found = line_gains(power, weight)
+    found = line_evidence(power, weight)
     assert np.quantile(null, 0.95) < 4.0
     assert (found.argmax(axis=-1) == 123).all()
     assert found.max(axis=-1).min() > 10.0

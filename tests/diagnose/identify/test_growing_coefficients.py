@@ -11,11 +11,11 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.identify.identification import Claim, Naming
-from gyrostab.diagnose.predict.condition import Part, without_turns
+from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.predict.condition import Component, without_turns
 from gyrostab.diagnose.predict.designs import Candidate, Variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.result.tables import claim_tables
+from gyrostab.diagnose.result.tables import identification_tables
 from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
 from gyrostab.diagnose.statistics import sample_counts as distribution
 from gyrostab.diagnose.statistics import spectral_line as spectrum
@@ -88,15 +88,15 @@ def test_the_page_has_what_the_script_writes(small) -> None:
 # ------------------------------------------------------------------------------------------------- a name without a box
 
 
-def naming(view: str, *, place: int = -1, gain: float = 40.0) -> Naming:
+def naming(view: str, *, place: int = -1, gain: float = 40.0) -> Identifications:
     there = np.zeros((1, 1, 40))
     there[..., 10:20] = 1.0
     variant = Variant({}, ("sensitivity",), there if view == "mean" else there[..., None])
-    part = Part(Candidate("shupe", view, ("temperature",), (variant,)), variant, ("y",), gain, place)
-    claim = Claim("shupe", ("temperature",), ("y",), (part, replace(part, gain=1.0)), gain, 7.0)
+    part = Component(Candidate("shupe", view, ("temperature",), (variant,)), variant, ("y",), gain, place)
+    claim = Identification("shupe", ("temperature",), ("y",), (part, replace(part, gain=1.0)), gain, 7.0)
     null = np.sort(np.random.default_rng(1).exponential(1.0, 400))
     nothing: Any = None
-    return Naming((claim,), (), 7.0, null, {}, (), nothing, nothing)
+    return Identifications((claim,), (), 7.0, null, {}, (), nothing, nothing)
 
 
 def reduced() -> xr.Dataset:
@@ -111,7 +111,7 @@ def reduced() -> xr.Dataset:
     ("view", "told", "taus"), [("mean", "mean", (20.0, 400.0)), ("power", "davar", (0.1, 20.0)), ("line", "spectrum", (0.371 / 0.5,) * 2)]
 )
 def test_an_effect_without_a_box_gets_one_where_it_acts(view: str, told: str, taus: tuple[float, float]) -> None:
-    (box,) = claim_tables(naming(view, place=9 if view == "line" else -1), reduced(), [])
+    (box,) = identification_tables(naming(view, place=9 if view == "line" else -1), reduced(), [])
     assert (box["view"], box["axes"], box["explained_by"]) == (told, ["y"], ["shupe"])
     assert (box["tau_min_s"], box["tau_max_s"]) == pytest.approx(taus)
     whole = view == "line"  # a steady line is there all the time
@@ -123,8 +123,8 @@ def test_an_effect_without_a_box_gets_one_where_it_acts(view: str, told: str, ta
 
 def test_an_effect_with_a_box_gets_no_other() -> None:
     known = [{"explained_by": ["shupe"], "axes": ["x", "y"]}]
-    assert claim_tables(naming("mean"), reduced(), known) == []
-    assert [box["id"] for box in claim_tables(naming("mean"), reduced(), [known[0] | {"axes": ["x"]}])] == [2]
+    assert identification_tables(naming("mean"), reduced(), known) == []
+    assert [box["id"] for box in identification_tables(naming("mean"), reduced(), [known[0] | {"axes": ["x"]}])] == [2]
 
 
 # ------------------------------------------------------------------------------------------------- levels that change

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key, gain_sum
-from gyrostab.diagnose.identify.identifiability import possible
-from gyrostab.diagnose.identify.jumps import jumps_at_will, sudden
+from gyrostab.diagnose.identify.components import by_key, sum_evidence
+from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.jumps import is_sudden, jumps_at_will
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 
@@ -27,15 +27,15 @@ def test_what_goes_over_within_some_blocks_is_no_jump(way: float, size: float, j
     course = np.clip((second - MIDDLE) / max(way, 1e-3) + 0.5, 0.0, 1.0)
     noise = 0.003 * 60.0 * np.sqrt(10.0) * np.random.default_rng(4).standard_normal((2, second.size))
     reduced = reduce_log(make_log(noise + size * course * [[1.0], [-0.8]], rate=10.0, unit="deg/h"))
-    baseline = from_model(reduced, MODEL)
+    baseline = baseline_from_model(reduced, MODEL)
     (jumps,) = (one for one in effect_candidates(reduced, baseline["coefficient"])[0] if (one.effect, one.view) == ("bias_jump", "mean"))
     state = begin_state(reduced, baseline)
-    parts = by_key(gains([jumps], reduced, state, fold_blocks(reduced)))[jumps.key]
-    assert gain_sum(parts) > 10.0
+    parts = by_key(compute_evidence([jumps], reduced, state, fold_blocks(reduced)))[jumps.key]
+    assert sum_evidence(parts) > 10.0
     assert abs(float(parts[0].variant.values["at"]) - MIDDLE) <= 30.0
     assert all(jumps_at_will(part, state) for part in parts)
-    assert sudden(parts, state) == jump
-    assert bool(possible(parts, state)) == jump
+    assert is_sudden(parts, state) == jump
+    assert bool(is_physical(parts, state)) == jump
 
 
 def test_where_power_came_back_a_jump_may_settle() -> None:
@@ -45,10 +45,10 @@ def test_where_power_came_back_a_jump_may_settle() -> None:
     rate = 0.6 * np.random.default_rng(4).standard_normal((2, second.size)) + 0.8 * course
     rate[:, (second >= 850.0) & (second < 960.0)] = np.nan
     reduced = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
-    baseline = from_model(reduced, MODEL)
+    baseline = baseline_from_model(reduced, MODEL)
     (jumps,) = (one for one in effect_candidates(reduced, baseline["coefficient"])[0] if (one.effect, one.view) == ("bias_jump", "mean"))
     state = begin_state(reduced, baseline)
     at = np.array([one.values["at"] for one in jumps.variants])
-    parts = {instant: Part(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0) for instant in (960.0, 1010.0)}
+    parts = {instant: Component(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0) for instant in (960.0, 1010.0)}
     assert [jumps_at_will(part, state) for part in parts.values()] == [False, True]
-    assert [sudden([part], state) for part in parts.values()] == [True, False]
+    assert [is_sudden([part], state) for part in parts.values()] == [True, False]

@@ -7,16 +7,16 @@ import pytest
 import xarray as xr
 from scipy.signal import butter, lfilter, sosfilt
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key, gain_sum
-from gyrostab.diagnose.identify.identifiability import possible
+from gyrostab.diagnose.identify.components import by_key, sum_evidence
+from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.logger_filters import filter_sizes, on_all_axes
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.filter_response import is_filter
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 
@@ -29,13 +29,13 @@ def test_a_filter_that_other_axes_deny_is_none_of_the_logger(late, one_filter):
     share = np.array(late)[:, None]
     raw = np.random.default_rng(5).standard_normal((share.size, 18_001))
     reduced = reduce_log(make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h"))
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     filters = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == "logger_filter"]
     state = begin_state(reduced, baseline)
-    parts = by_key(gains(filters, reduced, state, fold_blocks(reduced)))["logger_filter"]
-    assert gain_sum(parts) > 10.0
+    parts = by_key(compute_evidence(filters, reduced, state, fold_blocks(reduced)))["logger_filter"]
+    assert sum_evidence(parts) > 10.0
     assert on_all_axes(parts, state) == one_filter
-    assert possible(parts, state) == (parts if one_filter else [])
+    assert is_physical(parts, state) == (parts if one_filter else [])
 
 
 def test_a_cutoff_that_the_record_does_not_tell_has_an_interval_of_all_that_suit() -> None:
@@ -57,9 +57,9 @@ def test_a_cutoff_that_the_record_tells_keeps_its_narrow_interval() -> None:
 def _cutoff(log: xr.Dataset) -> tuple[float, float]:
     """95 % interval of the cutoff of a filter on all axes of a record."""
     reduced = reduce_log(log)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     candidate = next(one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == "logger_filter")
     variant = next(one for one in candidate.variants if is_filter("power", one))
-    parts = [Part(candidate, variant, (str(axis),), 50.0) for axis in reduced["axis"].values]
+    parts = [Component(candidate, variant, (str(axis),), 50.0) for axis in reduced["axis"].values]
     mean, error, *ends = filter_sizes(parts, begin_state(reduced, baseline))[0]["cutoff"]
     return (ends[0], ends[1]) if ends else (mean - 1.96 * error, mean + 1.96 * error)

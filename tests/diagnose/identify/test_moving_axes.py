@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from gyrostab import diagnose
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.moving_axes import moving_blocks, unexplained_motion, without_motion
 from gyrostab.diagnose.predict.candidates import windows_of
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
@@ -80,7 +80,7 @@ def test_left_out_on_the_axis_alone_and_kept_as_measured(seen):
 
 def test_the_noise_is_that_of_the_rest(seen):
     _, rest = seen
-    baseline = calibrate(rest)
+    baseline = calibrate_noise(rest)
     error = (baseline["coefficient"].sel(term="N") - N) / baseline["stderr"].sel(term="N")
     assert (np.abs(error) < 4.0).all()
     assert not baseline["quiet"].values[:, rest["moving"].values.any(axis=0)].any()
@@ -149,7 +149,7 @@ def test_what_moves_stays_in_where_the_rest_is_too_little_to_calibrate_on(turnin
     log = turning.assign(rate=turning["rate"].where(~gone).transpose("axis", "time").assign_attrs(turning["rate"].attrs))
     whole = reduce_log(log)
     with pytest.raises(SchemaError, match="axis z"):
-        calibrate(without_motion(log, whole, moving_blocks(whole)))
+        calibrate_noise(without_motion(log, whole, moving_blocks(whole)))
     with pytest.warns(UserWarning, match="compared with its motion in it.*axis z"):
         found = diagnose(log, nulls=100)
     assert found.verdict != "no mismatch"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.identify.components import gain_of
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.identify.components import evidence_of
 from gyrostab.diagnose.identify.forward_search import name_effects
-from gyrostab.diagnose.identify.identification import Claim, with_axes_of
+from gyrostab.diagnose.identify.identification import Identification, with_axes_of
 from gyrostab.diagnose.identify.overlapping import layers
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
@@ -20,7 +20,7 @@ VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
 
 
 def part(gain, *, row="x", witness=""):
-    return Part(Candidate("misalignment", "transfer", (), (VARIANT,), witness=(witness,)), VARIANT, (row,), gain)
+    return Component(Candidate("misalignment", "transfer", (), (VARIANT,), witness=(witness,)), VARIANT, (row,), gain)
 
 
 def test_rows_that_come_again_are_a_layer_of_their_own():
@@ -30,12 +30,12 @@ def test_rows_that_come_again_are_a_layer_of_their_own():
 
 def test_a_part_has_no_gain_of_another_witness():
     parts = [part(40.0, witness="z"), part(9.0, witness="seismometer")]
-    assert [gain_of(parts, part(1.0, witness=name)) for name in ("z", "seismometer", "y")] == [40.0, 9.0, 1.0]
+    assert [evidence_of(parts, part(1.0, witness=name)) for name in ("z", "seismometer", "y")] == [40.0, 9.0, 1.0]
 
 
 def test_a_claim_keeps_the_axes_that_show_it_beside_the_others():
     parts = (part(9.0), part(8.0, row="y"))
-    claim = Claim("misalignment", (), ("x", "y"), parts, 15.5, 8.0)
+    claim = Identification("misalignment", (), ("x", "y"), parts, 15.5, 8.0)
     key = parts[0].candidate.key
     assert with_axes_of(claim, {key: [part(9.0), part(1.0, row="y")]}).axes == ("x",)
     assert with_axes_of(claim, {key: [part(9.0), part(1.0, row="y")]}).parts == parts[:1]
@@ -47,7 +47,7 @@ def test_two_opposite_jumps_gain_together_what_none_gains_alone():
     jumps = [{"name": "bias_jump", "step": [step], "at": at, "axes": ["x"]} for step, at in ((0.3, 600.0), (-0.3, 1300.0))]
     model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003, "K": 0.005}, "effect": jumps}
     reduced = reduce_log(simulate(model, duration="30min", rate=10.0, seed=4).compute())
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     nulls = list(null_records(reduced, baseline, count=40, rng=np.random.default_rng(1), chunk=40))
     (claim,) = name_effects(reduced, baseline, nulls).claims
     assert claim.effect == "bias_jump"

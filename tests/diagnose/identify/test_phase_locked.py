@@ -9,27 +9,27 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.identify.phase_locked import without_waves
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.simulate import simulate
 
 N = 0.003  # deg/sqrt(h)
 
 
-def part(view: str, gain: float) -> Part:
+def part(view: str, gain: float) -> Component:
     variant = Variant({}, np.ones((1, 1, 1)), ("any",))
-    return Part(Candidate("rotation_line", view, (), (variant,)), variant, ("x",), gain)
+    return Component(Candidate("rotation_line", view, (), (variant,)), variant, ("x",), gain)
 
 
-def claim(*parts: Part) -> Claim:
-    return Claim("rotation_line", (), ("x",), parts, sum(one.gain for one in parts), 6.0)
+def claim(*parts: Component) -> Identification:
+    return Identification("rotation_line", (), ("x",), parts, sum(one.gain for one in parts), 6.0)
 
 
 def test_only_waves_are_taken_out_with_what_they_gain() -> None:
     mean, wave, comb = part("mean", 5.0), part("order", 20.0), part("phase_locked", 7.0)
-    naming = Naming((claim(mean, wave), claim(comb), claim(mean)), (), 6.0, np.zeros(1), {}, (), None, xr.DataArray())  # type: ignore[arg-type]
+    naming = Identifications((claim(mean, wave), claim(comb), claim(mean)), (), 6.0, np.zeros(1), {}, (), None, xr.DataArray())  # type: ignore[arg-type]
     left, gain = without_waves(naming)
     assert gain == 27.0
     assert [one.parts for one in left.claims] == [(mean,), (mean,)]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import by_key
 from gyrostab.diagnose.identify.forward_search import name_effects
-from gyrostab.diagnose.identify.identifiability import plainer_effect, possible
+from gyrostab.diagnose.identify.identifiability import find_plainer_effect, is_physical
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 from tests.support.named import nulls
@@ -34,10 +34,10 @@ def _reduced(share: float) -> xr.Dataset:
 
 
 def _parts(reduced: xr.Dataset):
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     known = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect in ("scale_factor", "real_motion")]
     state = begin_state(reduced, baseline)
-    parts = by_key(gains([one for one in known if one.view == "mean"], reduced, state, fold_blocks(reduced)))
+    parts = by_key(compute_evidence([one for one in known if one.view == "mean"], reduced, state, fold_blocks(reduced)))
     return {several[0].candidate.effect: several for several in parts.values()}, state
 
 
@@ -47,9 +47,9 @@ def test_the_share_of_the_turning_tells_what_it_is(share, plainer, allowed):
     motion, error = parts["real_motion"], parts["scale_factor"]
     assert motion[0].row == ("z",)
     assert motion[0].gain > 30.0
-    assert plainer_effect(motion, state) == plainer
-    assert bool(possible(motion, state)) is allowed
-    assert plainer_effect(error, state) is None
+    assert find_plainer_effect(motion, state) == plainer
+    assert bool(is_physical(motion, state)) is allowed
+    assert find_plainer_effect(error, state) is None
 
 
 def test_a_few_millionths_of_the_turning_are_an_error_of_the_scale_factor():

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from gyrostab.diagnose.baseline.calibrate import from_model
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import by_key
-from gyrostab.diagnose.identify.identifiability import possible
-from gyrostab.diagnose.identify.steady import always_there
+from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.steady import is_always_present
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State, begin_state
-from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 
@@ -22,17 +22,17 @@ MODEL = {"noise": {"N": 0.003}, "log": {"axes": ["x"]}}
 SECOND = np.arange(24_000) / 10.0
 
 
-def _wandering(size: float, share: float, seed: int) -> tuple[list[Part], State]:
+def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], State]:
     """Parts of a Gauss-Markov bias of 0.5 s that is there in every such share of 600 s."""
     rng = np.random.default_rng(seed)
     white = 0.003 * 60.0 * np.sqrt(10.0) * rng.standard_normal(SECOND.size)
     keep = np.exp(-0.2)
     bias = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(SECOND.size))
     reduced = reduce_log(make_log(white + size * bias * (share * 600.0 > SECOND % 600.0), rate=10.0, unit="deg/h"))
-    baseline = from_model(reduced, MODEL)
+    baseline = baseline_from_model(reduced, MODEL)
     biases = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.key == "gauss_markov" and one.view == "power"]
     state = begin_state(reduced, baseline)
-    return by_key(gains(biases, reduced, state, fold_blocks(reduced)))["gauss_markov"], state
+    return by_key(compute_evidence(biases, reduced, state, fold_blocks(reduced)))["gauss_markov"], state
 
 
 @pytest.mark.parametrize("size", [0.12, 0.18])
@@ -40,9 +40,9 @@ def _wandering(size: float, share: float, seed: int) -> tuple[list[Part], State]
 def test_what_comes_and_goes_is_no_steady_wander(size: float, share: float, steady: bool) -> None:
     parts, state = _wandering(size / np.sqrt(share), share, seed=3)
     assert parts[0].gain > 10.0
-    assert always_there(parts[0], state) == steady
-    assert bool(possible(parts, state)) == steady
+    assert is_always_present(parts[0], state) == steady
+    assert bool(is_physical(parts, state)) == steady
 
 
 def test_chance_takes_no_steady_wander_away() -> None:
-    assert all(always_there(parts[0], state) for parts, state in (_wandering(0.2, 1.0, seed) for seed in range(8)))
+    assert all(is_always_present(parts[0], state) for parts, state in (_wandering(0.2, 1.0, seed) for seed in range(8)))

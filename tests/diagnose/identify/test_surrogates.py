@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.surrogates import beats_slides
+from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import begin_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
@@ -24,11 +24,11 @@ def _slides(sensitivity: float, period: float) -> tuple[bool, float]:
         "environment": [{"profile": "ramps", "channel": "temperature", "unit": "degree_Celsius", "points": swing}],
     }
     reduced = reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     known, _ = effect_candidates(reduced, baseline["coefficient"])
     one = next(one for one in known if one.effect == "temperature_bias" and one.view == "mean")
     variant = next(each for each in one.variants if each.columns == ("sensitivity",))
-    return beats_slides([Part(one, variant, ("x",), 50.0)], begin_state(reduced, baseline), fold_blocks(reduced))
+    return passes_time_shift_test([Component(one, variant, ("x",), 50.0)], begin_state(reduced, baseline), fold_blocks(reduced))
 
 
 def test_a_channel_that_swings_is_no_worse_for_its_mirror_image():

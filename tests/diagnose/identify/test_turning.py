@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.estimate.joint_fit import fit_claims
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key, gain_sum
-from gyrostab.diagnose.identify.identification import Claim, Naming
+from gyrostab.diagnose.identify.components import by_key, sum_evidence
+from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import explain_away
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
@@ -38,17 +38,17 @@ def _table(effect, *names):
 def test_earth_rate_is_taken_out_and_made_again(around):
     log = _log({"name": "earth_rate", "latitude": 45.0, "toolface": 40.0, "off": [90.0, 90.0], "around": [0.0, around]})
     reduced = reduce_log(log)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
     orders = [one for one in known if one.view == "order"]
     start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    parts = by_key(gains(orders, reduced, start, folds))["earth_rate(rotation_rate)"]
-    assert gain_sum(parts) > 1000.0
-    state = explain_away(start, parts)
-    assert max(gain_sum(one) for one in by_key(gains(orders, reduced, state, folds)).values()) < 5.0
-    claim = Claim("earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0)
-    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds)
-    (fitted,) = fit_claims(naming, baseline)
+    parts = by_key(compute_evidence(orders, reduced, start, folds))["earth_rate(rotation_rate)"]
+    assert sum_evidence(parts) > 1000.0
+    state = condition_on(start, parts)
+    assert max(sum_evidence(one) for one in by_key(compute_evidence(orders, reduced, state, folds)).values()) < 5.0
+    claim = Identification("earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0)
+    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds)
+    (fitted,) = fit_identifications(naming, baseline)
     again = _log(_table(fitted.effect, "latitude", "toolface", "off", "around"))
     assert float(np.abs(again["rate"] - log["rate"]).max()) < 0.01 * float(log["rate"].std())
 
@@ -58,13 +58,13 @@ def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most
     """Of 4 % of the earth's rate across the tool, not of the angle itself, which depends on where it is counted from."""
     log = _log({"name": "earth_rate", "latitude": latitude, "toolface": 150.0, "off": [90.0, 90.0], "around": [0.0, 90.0]})
     reduced = reduce_log(log)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
     start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    parts = by_key(gains([one for one in known if one.view == "order"], reduced, start, folds))["earth_rate(rotation_rate)"]
-    claim = Claim("earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0)
-    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), explain_away(start, parts), folds)
-    found = fit_claims(naming, baseline)[0].parameters
+    parts = by_key(compute_evidence([one for one in known if one.view == "order"], reduced, start, folds))["earth_rate(rotation_rate)"]
+    claim = Identification("earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0)
+    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), condition_on(start, parts), folds)
+    found = fit_identifications(naming, baseline)[0].parameters
     assert found["latitude"].low < latitude < found["latitude"].high
     by_size = np.degrees(1.96 * 0.04 / np.tan(np.radians(latitude)))
     assert 0.9 * by_size < (found["latitude"].high - found["latitude"].low) / 2.0 < most
@@ -79,14 +79,14 @@ def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
     x = {"name": "rotation_line", "axes": ["x"]}
     log = _log(both, {**x, "order": 2.0, "amplitude": [0.8], "phase": [100.0]}, {**x, "order": 3.0, "amplitude": [0.4]}, points=points)
     reduced = reduce_log(log)
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
     orders = [one for one in known if one.view == "order" and one.effect == "rotation_line"]
     start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    parts = by_key(gains(orders, reduced, start, folds))["rotation_line(rotation_rate)"]
-    claim = Claim("rotation_line", parts[0].candidate.driver, ("x", "y"), tuple(parts), gain_sum(parts), 8.0)
-    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), explain_away(start, parts), folds)
-    fitted = fit_claims(naming, baseline)
+    parts = by_key(compute_evidence(orders, reduced, start, folds))["rotation_line(rotation_rate)"]
+    claim = Identification("rotation_line", parts[0].candidate.driver, ("x", "y"), tuple(parts), sum_evidence(parts), 8.0)
+    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), condition_on(start, parts), folds)
+    fitted = fit_identifications(naming, baseline)
     assert [(one.effect.order, one.axes) for one in fitted] == [(1.0, ("x", "y")), (2.0, ("x",)), (3.0, ("x",))]
     again = _log(*({**_table(one.effect, "amplitude", "phase", "order"), "axes": list(one.axes)} for one in fitted), points=points)
     left, whole = ((one["rate"] - log["rate"]).std("time").values for one in (again, _log(points=points)))

@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from gyrostab.diagnose.locate.mismatches import locate
-from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.locate.mismatches import locate_mismatches
+from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError
@@ -41,7 +41,9 @@ def test_false_alarms_come_as_often_as_asked(base, null):
         low, high = stats.binom.ppf([0.001, 0.999], 300, level)
         slack = 1.0 + 2.0 / np.sqrt(200 * level)  # what 200 null records leave open
         assert low / slack <= (p < level).sum() <= high * slack, level
-    alarms = [locate(records(base, 1, np.random.default_rng(seed)).isel(record=0), base, null).sizes["mismatch"] for seed in range(15)]
+    alarms = [
+        locate_mismatches(records(base, 1, np.random.default_rng(seed)).isel(record=0), base, null).sizes["mismatch"] for seed in range(15)
+    ]
     assert sum(alarms) <= 2
 
 
@@ -50,11 +52,11 @@ def test_a_level_decides_what_is_told(base, null):
     found["power"][0, 75:90] *= 1.06
     p = float(smallest_p(found, base, null))
     assert 1e-6 < p < 0.2
-    assert locate(found, base, null, level=1.5 * p).sizes["mismatch"] >= 1
-    assert locate(found, base, null, level=0.7 * p).sizes["mismatch"] == 0
+    assert locate_mismatches(found, base, null, level=1.5 * p).sizes["mismatch"] >= 1
+    assert locate_mismatches(found, base, null, level=0.7 * p).sizes["mismatch"] == 0
     for level in (0.0, 0.7, -1.0):
         with pytest.raises(OptionError, match="false alarms"):
-            locate(found, base, null, level=level)
+            locate_mismatches(found, base, null, level=level)
 
 
 def test_too_few_null_records_are_refused(base):
@@ -71,7 +73,7 @@ def test_a_burst_of_noise_has_its_box(share, missing):
     for seed in range(9):
         found = records(base, 1, np.random.default_rng(seed), missing=missing).isel(record=0)
         found["power"][1, 75:90] *= 1.0 + share**2
-        boxes = locate(found, base, null)
+        boxes = locate_mismatches(found, base, null)
         boxes = boxes.sel(mismatch=(boxes["view"] == "davar") & (boxes["axes"] == "y"))
         overlaps.append(_overlap(boxes.isel(mismatch=0), 1500.0, 1800.0) if boxes.sizes["mismatch"] else 0.0)
         if share == 0.5:
@@ -89,7 +91,7 @@ def test_a_step_of_the_mean_has_its_box(base, null):
         found = records(base, 1, np.random.default_rng(seed)).isel(record=0)
         found["mean"][0, 30:45] += 0.1
         found["mean"][0, 120:140] -= 0.1
-        boxes = locate(found, base, null)
+        boxes = locate_mismatches(found, base, null)
         boxes = boxes.sel(mismatch=boxes["view"] == "mean")
         assert boxes.sizes["mismatch"] == 2
         assert set(boxes["axes"].values) == {"x"}
@@ -105,7 +107,7 @@ def test_a_band_has_its_averaging_times(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     inside = (found["frequency"].values > 3.0) & (found["frequency"].values < 12.0)
     found["power"][0, 60:120] *= 1.0 + 3.0 * xr.DataArray(inside.astype(float), dims="band")
-    box = locate(found, base, null).isel(mismatch=0)
+    box = locate_mismatches(found, base, null).isel(mismatch=0)
     assert str(box["view"].values) == "davar"
     assert float(box["tau_min_s"]) in (0.02, 0.04)
     assert float(box["tau_min_s"]) < 0.37 / 7.0 < float(box["tau_max_s"])
@@ -116,7 +118,7 @@ def test_a_band_has_its_averaging_times(base, null):
 def test_less_noise_than_simulated_has_its_sign(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["power"] *= 0.9
-    boxes = locate(found, base, null)
+    boxes = locate_mismatches(found, base, null)
     assert boxes.sizes["mismatch"] == 1  # of all axes together
     assert sorted(str(boxes["axes"].values[0]).split()) == ["x", "y", "z"]
     assert (float(boxes["begin"][0]), float(boxes["end"][0])) == (0.0, 3600.0)
@@ -128,7 +130,7 @@ def test_two_bursts_are_two_boxes(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["power"][0, 30:45] *= 1.3
     found["power"][0, 100:115] *= 1.3
-    boxes = locate(found, base, null)
+    boxes = locate_mismatches(found, base, null)
     begins = sorted(boxes["begin"].values)
     assert boxes.sizes["mismatch"] == 2
     assert begins[0] == pytest.approx(600.0, abs=2 * BLOCK_S)
@@ -138,7 +140,7 @@ def test_two_bursts_are_two_boxes(base, null):
 def test_a_mean_that_wanders_is_one_mismatch(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["mean"][1] += 0.5 * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
-    boxes = locate(found, base, null)
+    boxes = locate_mismatches(found, base, null)
     boxes = boxes.sel(mismatch=boxes["view"] == "mean")
     assert boxes["sign"].values.tolist() == [0]
     assert float(boxes["end"][0] - boxes["begin"][0]) > 3000.0
@@ -149,12 +151,12 @@ def test_pieces_become_one_box_and_strangers_do_not():
     box = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 100.0, "tau_min_s": 0.01, "tau_max_s": 0.1}
     box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
     near, far = box | {"begin": 120.0, "end": 160.0, "z": 6.0}, box | {"begin": 400.0, "end": 460.0, "z": 6.0}
-    assert [(one["begin"], one["end"]) for one in merged([far, near, box])] == [(0.0, 160.0), (400.0, 460.0)]
-    assert len(merged([box, box | {"sign": -1}])) == 2
-    assert len(merged([box, box | {"tau_min_s": 1.0, "tau_max_s": 2.0}])) == 2
+    assert [(one["begin"], one["end"]) for one in merge_regions([far, near, box])] == [(0.0, 160.0), (400.0, 460.0)]
+    assert len(merge_regions([box, box | {"sign": -1}])) == 2
+    assert len(merge_regions([box, box | {"tau_min_s": 1.0, "tau_max_s": 2.0}])) == 2
     line = box | {"view": "spectrum", "what": "line", "frequency": 13.35, "tau_min_s": 0.028, "tau_max_s": 0.028}
-    assert len(merged([line, line | {"frequency": 13.45, "begin": 100.0, "end": 200.0}])) == 1
-    assert len(merged([line, line | {"frequency": 14.35}])) == 2
+    assert len(merge_regions([line, line | {"frequency": 13.45, "begin": 100.0, "end": 200.0}])) == 1
+    assert len(merge_regions([line, line | {"frequency": 14.35}])) == 2
 
 
 # -- the whole way from samples ------------------------------------------------------------------------------------------------
@@ -246,7 +248,7 @@ def _spikes(rate, t, rng):
 )
 def test_effects_in_samples_are_found_where_they_are(raw, effect, view, axes, begin, end):
     base, null, _ = raw
-    boxes = locate(_log(2, effect), base, null)
+    boxes = locate_mismatches(_log(2, effect), base, null)
     boxes = boxes.sel(mismatch=boxes["view"] == view)
     assert boxes.sizes["mismatch"] >= 1
     first = boxes.isel(mismatch=0)
@@ -261,12 +263,12 @@ def test_effects_in_samples_are_found_where_they_are(raw, effect, view, axes, be
 
 def test_samples_without_an_effect_have_no_box(raw):
     base, null, reduced = raw
-    assert locate(reduced, base, null).sizes["mismatch"] == 0
+    assert locate_mismatches(reduced, base, null).sizes["mismatch"] == 0
 
 
 def test_the_table_says_what_the_contract_needs(raw):
     base, null, _ = raw
-    boxes = locate(_log(2, _vibration), base, null)
+    boxes = locate_mismatches(_log(2, _vibration), base, null)
     assert boxes["mismatch"].values[0] == 1
     assert np.all(np.diff(boxes["p_value"].values) >= 0)
     start = boxes["start_time"].values[0] - np.datetime64(0, "ns")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate, from_model
-from gyrostab.diagnose.evidence.held_out import mean_gains, power_gains
+from gyrostab.diagnose.baseline.calibrate import baseline_from_model, calibrate_noise
+from gyrostab.diagnose.evidence.held_out import mean_evidence, power_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.outliers import CHANCE
@@ -38,7 +38,7 @@ def joined(records: list[xr.Dataset]) -> xr.Dataset:
 def both(lost: float) -> tuple[xr.Dataset, xr.Dataset]:
     """Raw records, and null records with the same noise, known exactly."""
     records = [raw(seed, lost, axes="xy") for seed in range(RECORDS)]
-    baseline = from_model(records[0], {"noise": NOISE})
+    baseline = baseline_from_model(records[0], {"noise": NOISE})
     nulls = joined(list(null_records(records[0], baseline, count=160, rng=np.random.default_rng(3))))
     names = [name for name in nulls.data_vars if "record" in nulls[name].dims]
     return xr.concat([one[names] for one in records], "record", coords="minimal", compat="override", join="override"), nulls
@@ -89,7 +89,7 @@ def test_neighbouring_bands_scatter_together_as_in_raw_logs(lost):
 
 def test_lowest_bands_scatter_with_the_third_above_as_the_taper_says():
     record = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute())
-    baseline = calibrate(record)
+    baseline = calibrate_noise(record)
     nulls = joined(list(null_records(record, baseline, count=400, rng=np.random.default_rng(2))))
     left = nulls["power"].transpose("axis", "band", ...).values.reshape(record.sizes["axis"] * record.sizes["band"], -1)
     shape = baseline["shape_alone"].isel(axis=0, block=5).values
@@ -100,7 +100,7 @@ def test_lowest_bands_scatter_with_the_third_above_as_the_taper_says():
 
 def test_rare_kurtoses_are_as_rare_as_in_samples():
     record = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute())
-    nulls = joined(list(null_records(record, calibrate(record), count=200, rng=np.random.default_rng(2))))
+    nulls = joined(list(null_records(record, calibrate_noise(record), count=200, rng=np.random.default_rng(2))))
     size = int(record.attrs["block_samples"])
     samples = np.random.default_rng(3).standard_normal((50_000, size))
     square = (samples - samples.mean(axis=1, keepdims=True)) ** 2
@@ -111,7 +111,7 @@ def test_rare_kurtoses_are_as_rare_as_in_samples():
 
 def test_lattices_give_repeats_zeros_and_extremes():
     record = raw(1, 0.0, lattice=0.5)
-    nulls = joined(list(null_records(record, calibrate(record), count=50, rng=np.random.default_rng(1))))
+    nulls = joined(list(null_records(record, calibrate_noise(record), count=50, rng=np.random.default_rng(1))))
     for name, scatter in (("repeats", 4.0), ("zeros", 4.0), ("stuck", 4.0), ("filled", 6.0)):
         many = float(nulls[name].sum("block").mean())
         assert float(record[name].sum()) == pytest.approx(many, abs=scatter * np.sqrt(many))
@@ -130,7 +130,7 @@ def test_blocks_of_few_samples_may_repeat_them_too():
     record = reduce_log(log)
     sparse = np.isnan(record["neighbours"].values[0]) & (record["samples"].values[0] > 0)
     assert sparse.sum() > 30
-    baseline = calibrate(record)
+    baseline = calibrate_noise(record)
     nulls = joined(list(null_records(record, baseline, count=100, rng=np.random.default_rng(2))))
     many = float(nulls["repeats"].values[:, 0, sparse].sum(axis=1).mean())
     found = float(record["repeats"].values[0, sparse].sum())
@@ -153,7 +153,9 @@ def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
         return reduce_log(log)
 
     records = [made(seed) for seed in range(6)]
-    nulls = joined(list(null_records(records[0], from_model(records[0], {"noise": {"N": 0.003}}), count=50, rng=np.random.default_rng(1))))
+    nulls = joined(
+        list(null_records(records[0], baseline_from_model(records[0], {"noise": {"N": 0.003}}), count=50, rng=np.random.default_rng(1)))
+    )
     for name, rel in (("order", 0.08), ("profile", 0.05), ("witness_cross", 0.1)):
         found = np.concatenate([np.abs(one[name].values.ravel()) ** 2 for one in records])
         other = np.abs(nulls[name].values) ** 2
@@ -162,7 +164,7 @@ def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
 
 def test_the_same_generator_gives_the_same_records():
     record = raw(1, 0.3)
-    baseline = calibrate(record)
+    baseline = calibrate_noise(record)
     one, other = (next(null_records(record, baseline, count=2, rng=np.random.default_rng(5))) for _ in range(2))
     xr.testing.assert_identical(one, other)
 
@@ -191,10 +193,10 @@ def test_largest_gains_of_raw_logs_are_those_of_their_own_null_records(lost):
     ranks = {"mean": [], "power": []}
     for seed in range(records):
         record = raw(100 + seed, lost)
-        baseline = calibrate(record)
+        baseline = calibrate_noise(record)
         nulls = joined(list(null_records(record, baseline, count=count, rng=np.random.default_rng(seed))))
         means, powers = candidates(record)
-        for view, gains, tried in (("mean", mean_gains, means), ("power", power_gains, powers)):
+        for view, gains, tried in (("mean", mean_evidence, means), ("power", power_evidence, powers)):
             own = float(gains(record, baseline, tried, axis="x").max())
             ranks[view].append(int((gains(nulls, baseline, tried, axis="x").max("candidate") >= own).sum()))
     for view, found in ranks.items():

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.held_out import cell_factors, power_factors
-from gyrostab.diagnose.predict.candidates import VIEWS, effect_candidates, term_density, windows_of
-from gyrostab.diagnose.predict.linear_model import begin_state, cells_of, drawn, effective, power_column
-from gyrostab.diagnose.predict.nuisance import generic_candidates, splines
+from gyrostab.diagnose.evidence.held_out import linear_model_factors, power_factors
+from gyrostab.diagnose.predict.candidates import STATISTIC_NAMES, effect_candidates, term_density, windows_of
+from gyrostab.diagnose.predict.linear_model import begin_state, build_linear_model, drawn, effective, power_column
+from gyrostab.diagnose.predict.nuisance import nuisance_alternatives, splines
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import effects
@@ -40,7 +40,7 @@ def test_every_effect_is_tried_or_a_reason_is_given(found):
     tried = {one.effect for one in candidates}
     assert tried.isdisjoint(reasons)
     assert tried | set(reasons) | {"fringe_hop"} == set(effects())
-    assert {one.view for one in candidates} <= set(VIEWS)
+    assert {one.view for one in candidates} <= set(STATISTIC_NAMES)
     for reason in reasons.values():
         assert reason.startswith("not identifiable: ")
 
@@ -162,13 +162,13 @@ def test_splines_add_to_one():
 
 @pytest.mark.parametrize("common", [0.0, 0.05])
 def test_cells_of_powers_are_scored_as_powers(plain, common):
-    baseline = calibrate(plain)
+    baseline = calibrate_noise(plain)
     baseline = baseline.assign(common=baseline["common"] + common)
     folds = fold_blocks(plain)
-    generic = [one for one in generic_candidates(plain) if one.effect == "~N(t)"]
+    generic = [one for one in nuisance_alternatives(plain) if one.effect == "~N(t)"]
     state = begin_state(plain, baseline)
-    cells = cells_of(generic, 0, plain, state)
-    mine = cell_factors(cells, folds)[:, 1:]
+    cells = build_linear_model(generic, 0, plain, state)
+    mine = linear_model_factors(cells, folds)[:, 1:]
     designs = [power_column(one, 0, state) / baseline["spectrum"].values[0] for one in generic[0].variants[0].design]
     theirs = power_factors(plain, baseline, [np.stack(designs, axis=-1)], axis="x", folds=folds)[:, 1:]
     np.testing.assert_allclose(mine, theirs, atol=1e-6)
@@ -176,9 +176,9 @@ def test_cells_of_powers_are_scored_as_powers(plain, common):
 
 @pytest.mark.parametrize("view", ["cross", "order"])
 def test_noise_has_the_variance_that_the_weights_say(rich, view):
-    baseline = calibrate(rich)
+    baseline = calibrate_noise(rich)
     candidates = [one for one in effect_candidates(rich, COEFFICIENT)[0] if one.view == view and one.each][:1]
-    cells = cells_of(candidates, 0, rich, begin_state(rich, baseline))
+    cells = build_linear_model(candidates, 0, rich, begin_state(rich, baseline))
     z = (cells.values[..., 0] * np.sqrt(cells.weight))[(cells.weight > 0) & np.isfinite(cells.values[..., 0])]
     assert np.mean(z**2) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / z.size) + 0.03)
     some = drawn(cells, np.random.default_rng(1), 3)
@@ -206,7 +206,7 @@ def test_simulated_wander_has_the_variance_of_the_face():
 
 
 def test_generics_have_the_axes_of_the_record(plain):
-    assert {one.view for one in generic_candidates(plain)} == {"mean", "power", "cross", "marks"}
+    assert {one.view for one in nuisance_alternatives(plain)} == {"mean", "power", "cross", "marks"}
     alone = plain.isel(axis=[0]).drop_dims("pair") if "pair" in plain.dims else plain
     assert isinstance(alone, xr.Dataset)
-    assert "cross" not in {one.view for one in generic_candidates(alone)}
+    assert "cross" not in {one.view for one in nuisance_alternatives(alone)}

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Part, take_part, without_odd
+from gyrostab.diagnose.predict.condition import Component, condition_on_component, mask_anomalous_blocks
 from gyrostab.diagnose.predict.linear_model import begin_state, cross_without
 from tests.support.reduced_records import baseline, records
 
@@ -24,9 +24,9 @@ def reduced() -> xr.Dataset:
     return found.assign(outliers=(("axis", "block"), outliers))
 
 
-def spikes(axis: str) -> Part:
+def spikes(axis: str) -> Component:
     variant = Variant({}, ("outliers",), np.ones((1, 1, 1)))
-    return Part(Candidate("spikes", "marks", (), (variant,)), variant, (axis,), 20.0)
+    return Component(Candidate("spikes", "marks", (), (variant,)), variant, (axis,), 20.0)
 
 
 def lost(found: xr.DataArray, before: xr.DataArray) -> set[tuple[str, int]]:
@@ -50,18 +50,18 @@ def test_what_two_axes_share_is_left_out_where_either_of_them_is(reduced: xr.Dat
 
 
 def test_blocks_of_named_spikes_are_left_out_of_means_powers_and_what_axes_share(reduced: xr.Dataset) -> None:
-    on_y, on_both = without_odd(reduced, [spikes("y")]), without_odd(reduced, [spikes("y"), spikes("z")])
+    on_y, on_both = mask_anomalous_blocks(reduced, [spikes("y")]), mask_anomalous_blocks(reduced, [spikes("y"), spikes("z")])
     for name in ("mean", "power"):
         assert lost(on_y[name], reduced[name]) == {("y", 5), ("y", 9)}
         assert lost(on_both[name], reduced[name]) == {("y", 5), ("y", 9), ("z", 9)}
     assert lost(on_y["cross"], reduced["cross"]) == {("xy", 5), ("yz", 5), ("xy", 9), ("yz", 9)}
     assert lost(on_both["cross"], reduced["cross"]) == {("xy", 5), ("yz", 5), ("xy", 9), ("xz", 9), ("yz", 9)}
-    assert without_odd(reduced, [spikes("x")]) is reduced  # it has none
+    assert mask_anomalous_blocks(reduced, [spikes("x")]) is reduced  # it has none
 
 
 def test_they_are_left_out_for_the_effects_that_are_sought_next(reduced: xr.Dataset) -> None:
     state = begin_state(reduced, baseline(blocks=BLOCKS))
-    found = take_part(state, spikes("y")).reduced
+    found = condition_on_component(state, spikes("y")).reduced
     for name in ("mean", "power"):
         assert lost(found[name], reduced[name]) == {("y", 5), ("y", 9)}
     assert lost(found["cross"], reduced["cross"]) == {("xy", 5), ("yz", 5), ("xy", 9), ("yz", 9)}

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.sizes import part_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
@@ -27,11 +27,11 @@ def test_random_gaps_do_not_make_a_shared_band_smaller(log, rows):
     there = xr.DataArray(np.broadcast_to(~lost, (2, lost.shape[1])), dims=("axis", "time"))
     rate = log["rate"].transpose("axis", "time")
     reduced = reduce_log(log.assign(rate=rate.where(there).assign_attrs(rate.attrs)))
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     known, _ = effect_candidates(reduced, baseline["coefficient"])
     one = next(one for one in known if one.effect == "shared_source" and one.view == "cross")
     variant = next(each for each in one.variants if each.values["bandwidth"] == 0.5)
-    mean, covariance = part_mixture(Part(one, variant, ("x", "y"), 1.0), begin_state(reduced, baseline)).moments()
+    mean, covariance = component_mixture(Component(one, variant, ("x", "y"), 1.0), begin_state(reduced, baseline)).moments()
     error = float(np.sqrt(covariance[0, 0]))
     assert abs(mean[0] - 9e-6) < 3.0 * error
     assert error < 0.1 * mean[0]

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import gains
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.step_times import tried_instants
 from gyrostab.physics.prediction import Windows
 from tests.support.named import COEFFICIENT, record
@@ -71,9 +71,9 @@ def test_two_restarts_share_their_weight(restarted):
 def test_a_jump_where_power_came_back_needs_less_to_be_seen(restarted):
     middle = (restarted["begin"] + restarted["end"]) / 2.0
     moved = restarted.assign(mean=restarted["mean"] + 0.08 * (middle > _BACK))
-    state = begin_state(moved, calibrate(moved))
+    state = begin_state(moved, calibrate_noise(moved))
     weighed = _jumps(moved)
     alike = replace(weighed, variants=tuple(replace(one, weight=1.0) for one in weighed.variants))
-    found = [gains([one], moved, state, fold_blocks(moved))[0] for one in (weighed, alike)]
+    found = [compute_evidence([one], moved, state, fold_blocks(moved))[0] for one in (weighed, alike)]
     assert (found[0].gain > found[1].gain + 0.5).any()
     assert {one.values["at"] for one in found[0].best} == {_BACK}

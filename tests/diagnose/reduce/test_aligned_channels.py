@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
@@ -188,7 +188,7 @@ def kicked(skew: float, *, size: int = 60_000) -> xr.Dataset:
 def candidates_of(log: xr.Dataset) -> tuple[xr.Dataset, list[Any], dict[str, str]]:
     aligned = align_channels(log)
     reduced = reduce_log(aligned.log.assign_attrs(unused_channels=aligned.unused))
-    return reduced, *effect_candidates(reduced, calibrate(reduced)["coefficient"])
+    return reduced, *effect_candidates(reduced, calibrate_noise(reduced)["coefficient"])
 
 
 def test_a_ramp_of_another_file_reaches_the_search():

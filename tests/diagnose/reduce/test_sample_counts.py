@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.reduce.outliers import lattice_step
+from gyrostab.diagnose.reduce.outliers import quantization_step
 from gyrostab.ingest.make_log import make_log
 
 RATE = 100.0
@@ -95,15 +95,15 @@ def test_the_lattice_is_found_whatever_its_offset(seed: int, step: float, offset
     values = np.round(noise / step) * step + offset
     values = values.astype(np.float32).astype(np.float64) if single else values
     if not single or step > 1.01 * 64 * 8 * 2.0**-23 * np.abs(values).max():
-        assert lattice_step(values) == pytest.approx(step, rel=1e-3)
+        assert quantization_step(values) == pytest.approx(step, rel=1e-3)
     smooth = noise * step + offset
-    assert lattice_step(smooth) == 0.0
+    assert quantization_step(smooth) == 0.0
 
 
 def test_the_lattice_shows_where_spikes_off_it_are_as_common_as_its_rare_levels():
     rng = np.random.default_rng(9)
     values = np.round(rng.standard_normal(4000) / 0.1) * 0.1
     off = np.concatenate([values[:12] + 7.03, np.full(8, 6.777)])
-    assert lattice_step(np.concatenate([values, off])) == pytest.approx(0.1, rel=1e-9)
+    assert quantization_step(np.concatenate([values, off])) == pytest.approx(0.1, rel=1e-9)
     half = np.where(np.arange(4000) < 2000, values, rng.standard_normal(4000))  # half of the values have none
-    assert lattice_step(half) == 0.0
+    assert quantization_step(half) == 0.0

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.identify.identification import Claim
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part
-from gyrostab.diagnose.result.attribution import acting, spans
+from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.result.attribution import active_spans, spans
 from tests.support.named import COEFFICIENT, WORLD, record
 
 
@@ -23,23 +23,23 @@ def turning():
 def claim(reduced, effect, view):
     candidates, _ = effect_candidates(reduced, COEFFICIENT)
     one = next(one for one in candidates if one.effect == effect and one.view == view)
-    part = Part(one, one.variants[0], ("x",), 50.0, place=0)
-    return Claim(effect, one.driver, ("x",), (part,), 50.0, 8.0)
+    part = Component(one, one.variants[0], ("x",), 50.0, place=0)
+    return Identification(effect, one.driver, ("x",), (part,), 50.0, 8.0)
 
 
 def test_what_is_locked_to_the_rotation_acts_while_the_tool_turns(turning):
-    found = spans(acting(claim(turning, "rotation_line", "order"), turning), turning["begin"].values, turning["end"].values)
+    found = spans(active_spans(claim(turning, "rotation_line", "order"), turning), turning["begin"].values, turning["end"].values)
     assert found == [(1200.0, 3600.0)]
 
 
 def test_what_stands_at_rest_as_well_acts_at_rest_as_well(turning):
     one = claim(turning, "earth_rate", "order")
     both = replace(one, parts=(*one.parts, *claim(turning, "earth_rate", "mean").parts))
-    assert spans(acting(both, turning), turning["begin"].values, turning["end"].values) == [(0.0, 3600.0)]
+    assert spans(active_spans(both, turning), turning["begin"].values, turning["end"].values) == [(0.0, 3600.0)]
 
 
 def test_an_effect_of_a_channel_that_rests_less_than_half_of_the_time_acts_while_it_does_not_rest(turning):
-    (span,) = spans(acting(claim(turning, "scale_factor", "mean"), turning), turning["begin"].values, turning["end"].values)
+    (span,) = spans(active_spans(claim(turning, "scale_factor", "mean"), turning), turning["begin"].values, turning["end"].values)
     assert span == (1200.0, 3600.0)
 
 
@@ -49,5 +49,5 @@ def test_a_tenth_of_the_largest_counts_as_there(level, there):
     g = np.zeros(reduced.sizes["block"])
     g[40:60], g[100:120] = 5.0, 5.0 * level
     shaken = reduced.assign(channel_vibration=reduced["channel_vibration"].copy(data=g))
-    found = acting(claim(shaken, "vibration_rectification", "mean"), shaken)
+    found = active_spans(claim(shaken, "vibration_rectification", "mean"), shaken)
     np.testing.assert_array_equal(np.flatnonzero(found), [*range(40, 60), *(range(100, 120) if there else ())])

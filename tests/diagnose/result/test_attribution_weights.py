@@ -10,14 +10,14 @@ import xarray as xr
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predicted
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.identification import Claim, Naming
-from gyrostab.diagnose.locate.mismatches import locate
-from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.locate.mismatches import locate_mismatches
+from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Part, explain_away, odd_blocks
+from gyrostab.diagnose.predict.condition import Component, condition_on, find_anomalous_blocks
 from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.result.attribution import explanations
+from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.attribution_weights import needed
 from gyrostab.diagnose.statistics import mean
 from tests.support.named import COEFFICIENT, nulls, record
@@ -28,7 +28,7 @@ NAMES = (("vibration_noise", "power", "white"), ("vibration_rectification", "mea
 def _claim(candidates, effect, view, column):
     one = next(one for one in candidates if (one.effect, one.view) == (effect, view))
     variant = next(one for one in one.variants if one.columns == (column,) and one.values.get("exponent", 1.0) == 1.0)
-    return Claim(effect, one.driver, ("x",), (Part(one, variant, ("x",), 50.0),), 50.0, 8.0)
+    return Identification(effect, one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0)
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +50,8 @@ def shaken():
     claims = tuple(_claim(candidates, *names) for names in NAMES)
     state = begin_state(changed, baseline)
     for claim in claims[::-1]:  # odd samples are named first
-        state = explain_away(state, list(claim.parts))
-    naming = Naming(claims, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed))
+        state = condition_on(state, list(claim.parts))
+    naming = Identifications(claims, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed))
     return changed, baseline, naming, null_scores(baseline, chance)
 
 
@@ -71,11 +71,11 @@ def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(s
 
 def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
     reduced, baseline, naming, null = shaken
-    found = locate(reduced, baseline, null)
+    found = locate_mismatches(reduced, baseline, null)
     after = predicted(naming, baseline)
 
     def told(view, **options):
-        lists = explanations(found, naming.claims, reduced, after, null, level=0.005, **options)
+        lists = attribute_mismatches(found, naming.claims, reduced, after, null, level=0.005, **options)
         return {frozenset(names) for box, names in zip(found["view"].values, lists, strict=True) if box == view}
 
     def without(out):
@@ -91,11 +91,11 @@ def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
 def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
     reduced, baseline, naming, null = shaken
     loud, _, spikes = naming.claims
-    assert odd_blocks(spikes.parts[0], reduced).sum() == 2
-    found = locate(reduced, baseline, null)
+    assert find_anomalous_blocks(spikes.parts[0], reduced).sum() == 2
+    found = locate_mismatches(reduced, baseline, null)
     after = predicted(naming, baseline)
-    one = explanations(found, [loud], reduced, after, null, level=0.005)  # the loudest two blocks are still there
-    both = explanations(found, naming.claims, reduced, after, null, level=0.005)
+    one = attribute_mismatches(found, [loud], reduced, after, null, level=0.005)  # the loudest two blocks are still there
+    both = attribute_mismatches(found, naming.claims, reduced, after, null, level=0.005)
     davar = found["view"].values.tolist().index("davar")
     assert (one[davar], "vibration_noise" in both[davar]) == ([], True)
 
@@ -110,16 +110,16 @@ def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
     candidates, reasons = effect_candidates(moved, COEFFICIENT)
     one = next(one for one in candidates if (one.effect, one.view) == ("bias_jump", "mean"))
     variant = next(variant for variant in one.variants if variant.values["at"] == 1800.0)
-    claim = Claim("bias_jump", one.driver, ("x",), (Part(one, variant, ("x",), 50.0),), 50.0, 8.0)
-    state = explain_away(begin_state(moved, baseline), list(claim.parts))
-    naming = Naming((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(moved))
+    claim = Identification("bias_jump", one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0)
+    state = condition_on(begin_state(moved, baseline), list(claim.parts))
+    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(moved))
     fields = {"view": "mean", "axes": "x", "what": "mean", "begin": 1200.0, "end": 1800.0, "tau_min_s": 20.0, "tau_max_s": 600.0}
     fields |= {"frequency": np.nan, "sign": -1, "z": -8.0}
     box = xr.Dataset({name: ("mismatch", [value]) for name, value in fields.items()})
     assert mean.score(moved, baseline)["what"].values.tolist() == ["mean"]
 
     def explained(**options):
-        return explanations(box, [claim], moved, predicted(naming, baseline), null, level=0.005, **options)[0]
+        return attribute_mismatches(box, [claim], moved, predicted(naming, baseline), null, level=0.005, **options)[0]
 
     assert explained() == []  # by its time alone
     assert explained(without=lambda out: predicted(naming, baseline, left_out=out)) == told
@@ -171,7 +171,7 @@ def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near
     long = {"view": "davar", "axes": "x y", "what": "level", "begin": 100.0, "end": 400.0, "tau_min_s": 0.01, "tau_max_s": 2.0}
     long |= {"frequency": float("nan"), "sign": 1, "z": 90.0, "p_value": 1e-9}
     short = long | {"axes": "x", "begin": begin, "end": begin + 10.0, "z": 80.0}
-    assert len(merged([long, short])) == boxes
+    assert len(merge_regions([long, short])) == boxes
 
 
 @pytest.mark.parametrize(("axes", "told"), [("xy", ["spectral_line"]), ("x", [])])
@@ -187,9 +187,11 @@ def test_a_line_on_two_axes_is_why_they_vary_together(shaken, axes, told):
     place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
     candidates, _ = effect_candidates(shared, COEFFICIENT)
     one = next(one for one in candidates if (one.effect, one.view) == ("spectral_line", "line"))
-    claim = Claim("spectral_line", (), tuple(axes), tuple(Part(one, one.variants[0], (axis,), 50.0, place) for axis in axes), 50.0, 8.0)
-    found = locate(shared, baseline, null)
+    claim = Identification(
+        "spectral_line", (), tuple(axes), tuple(Component(one, one.variants[0], (axis,), 50.0, place) for axis in axes), 50.0, 8.0
+    )
+    found = locate_mismatches(shared, baseline, null)
     found = found.isel(mismatch=found["view"].values == "cross_axis")
     assert found.sizes["mismatch"] >= 1
-    lists = explanations(found, [claim], shared, baseline, null, level=0.005)
+    lists = attribute_mismatches(found, [claim], shared, baseline, null, level=0.005)
     assert all(names == told for names in lists)

@@ -16,15 +16,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_claims
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import mixture_limit
-from gyrostab.diagnose.identify.identification import Claim, Naming
-from gyrostab.diagnose.predict.condition import Part
+from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.designs import Candidate
 from gyrostab.diagnose.result import finish as conclude
-from gyrostab.diagnose.result.size_gate import supported_axes, with_supported_claims
-from gyrostab.diagnose.result.tables import effect_tables, unknown_tables
+from gyrostab.diagnose.result.size_gate import keep_supported, supported_axes
+from gyrostab.diagnose.result.tables import effect_tables, unidentified_tables
 from gyrostab.diagnose.result.text import summary
 from gyrostab.diagnose.result.verdict import decide_verdict, failed_checks
 from gyrostab.physics.registry import effects
@@ -41,15 +41,15 @@ def estimate(value: float, error: float) -> Estimate:
     return Estimate(value, error, value - 1.96 * error, value + 1.96 * error, "deg/h")
 
 
-def claim_of(effect: str, axes: str, gains: tuple[float, ...] | None = None, *, view: str = "mean") -> Claim:
+def claim_of(effect: str, axes: str, gains: tuple[float, ...] | None = None, *, view: str = "mean") -> Identification:
     one: Any = Candidate(effect, view, (), ())
     variant: Any = SimpleNamespace(values={}, columns=())
-    parts = tuple(Part(one, variant, (axis,), gain) for axis, gain in zip(axes, gains or (20.0,) * len(axes), strict=True))
-    return Claim(effect, (), tuple(axes), parts, 20.0 * len(axes), 8.0)
+    parts = tuple(Component(one, variant, (axis,), gain) for axis, gain in zip(axes, gains or (20.0,) * len(axes), strict=True))
+    return Identification(effect, (), tuple(axes), parts, 20.0 * len(axes), 8.0)
 
 
-def naming_with(*claims: Claim) -> Naming:
-    return Naming(claims, (), 8.0, np.zeros(1), {}, (), *[None] * 2)  # type: ignore[arg-type]
+def naming_with(*claims: Identification) -> Identifications:
+    return Identifications(claims, (), 8.0, np.zeros(1), {}, (), *[None] * 2)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_an_axis_is_supported_where_a_size_is_away_from_zero(parameters: dict[st
 def test_a_line_of_amplitude_zero_is_no_effect():
     claim = claim_of("spectral_line", "x", view="line")
     nothing = {"amplitude": Estimate(0.0, 0.0, 0.0, 0.0, "deg/h"), "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz")}
-    naming = with_supported_claims(naming_with(claim), [[Fitted(claim, ("x",), nothing, None)]])
+    naming = keep_supported(naming_with(claim), [[Fitted(claim, ("x",), nothing, None)]])
     assert not naming.claims
     assert [(one.axes, one.candidates) for one in naming.unknown] == [(("x",), ("spectral_line",))]
 
@@ -85,18 +85,18 @@ def test_an_effect_keeps_the_axes_on_which_its_size_is_known():
         [Fitted(other, ("z",), {"sensitivity": estimate(0.4, 0.1)}, None)],
     ]
     before = naming_with(claim, other)
-    naming = with_supported_claims(before, numbers)
+    naming = keep_supported(before, numbers)
     assert [(one.effect, one.axes) for one in naming.claims] == [("temperature_bias", ("x",)), ("shupe", ("z",))]
     assert naming.claims[0].parts == claim.parts[:1]
     assert [(one.axes, one.generic) for one in naming.unknown] == [(("y",), "~bias(t)")]
-    assert with_supported_claims(before, [numbers[0][:1], numbers[1]]).claims[0].axes == ("x",)
-    assert with_supported_claims(naming, [numbers[0][:1], numbers[1]]) is naming
+    assert keep_supported(before, [numbers[0][:1], numbers[1]]).claims[0].axes == ("x",)
+    assert keep_supported(naming, [numbers[0][:1], numbers[1]]) is naming
 
 
 def test_what_chance_does_too_is_not_left_as_unknown():
     claim = claim_of("temperature_bias", "xy", (30.0, 3.0))
     numbers = [[Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None) for axis, error in (("x", 0.1), ("y", 1.0))]]
-    naming = with_supported_claims(naming_with(claim), numbers)
+    naming = keep_supported(naming_with(claim), numbers)
     assert [one.axes for one in naming.claims] == [("x",)]
     assert not naming.unknown
 
@@ -104,13 +104,13 @@ def test_what_chance_does_too_is_not_left_as_unknown():
 def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
     """Vibration that does nothing, named by hand: what remains is a mismatch and no effect."""
     reduced = reduced_of(environment=[SHAKE])
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "vibration_rectification", "mean", ("sensitivity",))
     naming = replace(naming, null_best=np.arange(8.0))
     kept, first, fit = conclude.fit_supported(naming, baseline)
     assert (kept.claims, first, fit.fitted) == ((), [], [])
     assert effect_tables(fit.fitted, reduced) == []
-    (box,) = unknown_tables(fit.naming, reduced, [])
+    (box,) = unidentified_tables(fit.naming, reduced, [])
     assert box["explained_by"] == []
     assert "a bias made by vibration" in box["statement"]
 
@@ -183,9 +183,9 @@ def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: b
     """An event that is over says nothing of later, and the size of one near the end is not known before."""
     shaken = {"profile": "vibration", "points": points}
     reduced = reduced_of({"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, axes=("x",), environment=[shaken])
-    baseline = calibrate(reduced)
+    baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
-    held = conclude.worth(reduced, baseline, naming, fit_claims(naming, baseline))
+    held = conclude.worth(reduced, baseline, naming, fit_identifications(naming, baseline))
     assert math.isfinite(held["forecast_gain"]) == told
     assert held["log_likelihood_gain"] > 0.0
     if told:

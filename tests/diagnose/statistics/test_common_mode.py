@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.locate.mismatches import locate
-from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.locate.mismatches import locate_mismatches
+from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Part
-from gyrostab.diagnose.result.attribution import explanations
+from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.text import mismatch_statement
 from gyrostab.diagnose.statistics import common_mode as common
 from gyrostab.diagnose.statistics import mean
@@ -136,14 +136,14 @@ def test_one_axis_or_a_short_record_has_nothing_to_compare():
 
 def _claim(view: str, axes: str):
     variant = Variant({}, ("0",), np.broadcast_to(_waveform(), (1, 1, BLOCKS)))
-    parts = tuple(Part(Candidate("cause", view, (), (variant,)), variant, (axis,), 10.0) for axis in axes)
+    parts = tuple(Component(Candidate("cause", view, (), (variant,)), variant, (axis,), 10.0) for axis in axes)
     return SimpleNamespace(effect="cause", axes=tuple(axes), parts=parts)
 
 
 def test_it_becomes_one_box_which_the_effect_explains_that_takes_it_away(base, null):
     shares = np.array([1.0, 0.8, -0.9])
     found = _with(records(baseline(walk=TRUE), 1, np.random.default_rng(5)), shares).isel(record=0)
-    boxes = locate(found, base, null)
+    boxes = locate_mismatches(found, base, null)
     assert boxes["view"].values.tolist() == ["cross_axis"]
     assert boxes["what"].values.tolist() == ["slow"]
     assert set(str(boxes["axes"].values[0]).split()) == {"x", "y", "z"}
@@ -154,7 +154,7 @@ def test_it_becomes_one_box_which_the_effect_explains_that_takes_it_away(base, n
     known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _waveform()))
 
     def told(view, axes, after):
-        return explanations(boxes, [_claim(view, axes)], found, after, null, level=0.005)[0]
+        return attribute_mismatches(boxes, [_claim(view, axes)], found, after, null, level=0.005)[0]
 
     assert told("mean", "xyz", known) == ["cause"]
     assert told("mean", "xyz", base) == []  # is in the model and leaves the mismatch
@@ -166,5 +166,5 @@ def test_it_stays_apart_from_what_axes_share_inside_blocks():
     slow = {"view": "cross_axis", "axes": "x y z", "what": "slow", "begin": 0.0, "end": 3600.0, "tau_min_s": 20.0, "tau_max_s": 1800.0}
     slow |= {"frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
     fast = slow | {"what": "all in phase", "tau_min_s": 0.01, "tau_max_s": 20.0}
-    assert [box["what"] for box in merged([slow, fast])] == ["slow", "all in phase"]
-    assert len(merged([slow, slow | {"axes": "x y", "tau_min_s": 40.0}])) == 1
+    assert [box["what"] for box in merge_regions([slow, fast])] == ["slow", "all in phase"]
+    assert len(merge_regions([slow, slow | {"axes": "x y", "tau_min_s": 40.0}])) == 1

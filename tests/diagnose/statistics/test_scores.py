@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics import VIEWS, mean, restart
+from gyrostab.diagnose.statistics import STATISTICS, mean, restart
 from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
 from gyrostab.diagnose.statistics import phase_locked as locked
 from gyrostab.diagnose.statistics import power as davar
@@ -101,7 +101,7 @@ def test_scores_are_normal_without_an_effect(missing, slow):
     base = baseline(missing=missing, **slow)
     found = records(base, 40, np.random.default_rng(3), missing=missing)
     for name in ("davar", "mean", "cross_axis", "spectrum"):
-        scores = VIEWS[name](found, base)
+        scores = STATISTICS[name](found, base)
         z = scores["z"].values
         z = z[np.isfinite(z)]
         assert abs(z.mean()) < 0.05, name
@@ -200,7 +200,7 @@ def test_mean_estimates_the_step(base):
     best = int(np.nanargmax(scores["z"].values[2, :, 0]))
     assert (int(scores["first"][best]), int(scores["stop"][best])) == (60, 105) or abs(int(scores["first"][best]) - 60) <= 4
     inside = (np.arange(180) >= 60) & (np.arange(180) < 105)
-    assert mean.box_mean(found, base, 2, inside) == pytest.approx(0.5, abs=0.03)
+    assert mean.region_mean(found, base, 2, inside) == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_line_has_its_amplitude():
@@ -315,8 +315,8 @@ def test_noise_that_is_loud_for_a_while_is_neither_shared_nor_a_line(loud):
         noise = np.random.default_rng(seed).standard_normal((2, 12_000))
         noise[:, slice(*loud)] *= 8.0
         found = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="100samples")
-        base = calibrate(found, quiet=np.arange(120) < 60)
+        base = calibrate_noise(found, quiet=np.arange(120) < 60)
         for name, values in largest.items():
-            values.append(float(np.nanmax(np.abs(VIEWS[name](found, base)["z"].values))))
+            values.append(float(np.nanmax(np.abs(STATISTICS[name](found, base)["z"].values))))
     assert max(largest["cross_axis"]) < 4.8
     assert max(largest["spectrum"]) < 4.8

@@ -8,9 +8,9 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.baseline.calibrate import calibrate
-from gyrostab.diagnose.locate.mismatches import locate
-from gyrostab.diagnose.locate.regions import merged
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.locate.mismatches import locate_mismatches
+from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.records import _leaked
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -119,10 +119,10 @@ def test_noise_that_axes_share_is_not_restless(base, null):
 def test_a_burst_that_has_its_box_is_not_told_again(base, null):
     found = _some(base, 1, 9).isel(record=0)
     found["power"][0, 60:75] *= 1.7
-    boxes = locate(found, base, null)
+    boxes = locate_mismatches(found, base, null)
     assert boxes["what"].values.tolist() == ["level"] or set(boxes["what"].values) == {"avar"}
     found["power"][1] *= np.exp(0.5 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 9.0))[:, None]
-    boxes = locate(found, base, null)
+    boxes = locate_mismatches(found, base, null)
     new = boxes.sel(mismatch=[str(what).startswith("restless") for what in boxes["what"].values])
     assert "y" in {axis for axes in new["axes"].values for axis in str(axes).split()}
     assert float(new["end"].max() - new["begin"].min()) > 0.9 * BLOCKS * 20.0
@@ -221,8 +221,8 @@ def test_one_axis_has_no_row_of_all():
 def test_a_level_and_its_scatter_are_two_mismatches():
     box = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 100.0, "tau_min_s": 0.01, "tau_max_s": 0.1}
     box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
-    assert len(merged([box, box | {"what": "restless 20 s"}])) == 2
-    assert len(merged([box | {"what": "restless 40 s"}, box | {"what": "restless 20 s", "axes": "x y"}])) == 1
+    assert len(merge_regions([box, box | {"what": "restless 20 s"}])) == 2
+    assert len(merge_regions([box | {"what": "restless 40 s"}, box | {"what": "restless 20 s", "axes": "x y"}])) == 1
 
 
 def test_sentences_say_how_fast_and_where_to():
@@ -255,6 +255,6 @@ def test_a_stretch_that_ends_within_a_block_leaves_nothing_restless():
     noise = np.random.default_rng(5).standard_normal((2, 60_000))
     noise[:, 20_000:40_400] *= 6.0
     reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples")
-    base = calibrate(reduced, quiet=np.arange(60) < 20)
+    base = calibrate_noise(reduced, quiet=np.arange(60) < 20)
     told = restless.levelled(reduced, base, [(("x", "y"), 2_000.0, 4_100.0)])
     assert float(np.nanmax(restless.score(told, base)["z"].values)) < 4.8
